@@ -1,0 +1,26 @@
+//! Frames → motion: how the image moved since the previous frame, and where the camera is.
+
+/// A corner followed from the previous frame to this one.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub struct TrackedCorner {
+    /// Where it was in the previous frame, raw px (column, row).
+    pub from_px: [f32; 2],
+    /// Where it is in this frame, raw px (column, row).
+    pub to_px: [f32; 2],
+}
+
+/// The image's motion since the previous frame.
+#[derive(Clone, Debug, Default, PartialEq)]
+pub struct Shift {
+    /// Shift of the image's content along the columns, px; negative when the robot moves towards +x.
+    /// `None` on the first frame and where tracking was lost.
+    pub dx_px: Option<f64>,
+    /// Shift along the rows, px.
+    pub dy_px: Option<f64>,
+    /// Scale of the image; above 1 the camera came closer.
+    pub scale: Option<f64>,
+    /// Median distance of the corners from the fitted motion, px.
+    pub residual_px: Option<f64>,
+    /// The corners that were followed.
+    pub corners: Vec<TrackedCorner>,
+}

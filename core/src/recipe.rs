@@ -1,0 +1,363 @@
+//! Every tunable of the processing in one table: unit, default, range and reason.
+//!
+//! A recipe is read from TOML (or a built-in name), changed with `--set key=value`, checked, and kept
+//! with every result. Unknown keys are refused.
+
+use serde::{Deserialize, Serialize};
+use serde_json::Value;
+
+use crate::error::{Error, Result};
+
+/// The built-in recipes, the default first.
+pub const BUILT_IN: [&str; 2] = ["paper", "paper-literal"];
+
+/// What values an option takes.
+#[derive(Clone, Debug, PartialEq, Serialize)]
+#[serde(tag = "kind", rename_all = "snake_case")]
+pub enum Range {
+    /// A number between two limits, both included.
+    Number {
+        /// Smallest value.
+        min: f64,
+        /// Largest value.
+        max: f64,
+        /// True where only whole numbers make sense.
+        whole: bool,
+    },
+    /// True or false.
+    Flag,
+    /// One of a few words.
+    Choice {
+        /// The words.
+        of: Vec<&'static str>,
+    },
+}
+
+/// One tunable, as `/api/options` and `--help` show it.
+#[derive(Clone, Debug, Serialize)]
+pub struct OptionInfo {
+    /// Dotted key, as in TOML and `--set`.
+    pub key: &'static str,
+    /// Unit of the value; empty where it has none.
+    pub unit: &'static str,
+    /// Value when nothing is said.
+    pub default: Value,
+    /// What values it takes.
+    pub range: Range,
+    /// What it does and why one would change it.
+    pub doc: String,
+}
+
+/// The way a run is measured.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Serialize, Deserialize)]
+#[serde(rename_all = "lowercase")]
+pub enum Method {
+    /// The publication, step by step (METHOD.md).
+    #[default]
+    Paper,
+}
+
+fn number(min: f64, max: f64) -> Range {
+    Range::Number { min, max, whole: false }
+}
+
+fn whole(min: u32, max: u32) -> Range {
+    Range::Number { min: f64::from(min), max: f64::from(max), whole: true }
+}
+
+fn flag() -> Range {
+    Range::Flag
+}
+
+macro_rules! recipe {
+    ($($(#[doc = $group_doc:literal])* $group:ident: $Group:ident {
+        $($(#[doc = $doc:literal])* $key:ident: $type:ty = $default:expr, $unit:literal, $range:expr;)*
+    })*) => {
+        $(
+            $(#[doc = $group_doc])*
+            #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+            #[serde(default, deny_unknown_fields)]
+            pub struct $Group { $($(#[doc = $doc])* pub $key: $type,)* }
+
+            impl Default for $Group {
+                fn default() -> Self {
+                    $Group { $($key: $default,)* }
+                }
+            }
+        )*
+
+        /// Every tunable of one processing.
+        #[derive(Clone, Debug, Default, PartialEq, Serialize, Deserialize)]
+        #[serde(default, deny_unknown_fields)]
+        pub struct Recipe {
+            /// The way the run is measured.
+            pub method: Method,
+            $($(#[doc = $group_doc])* pub $group: $Group,)*
+        }
+
+        /// All options, in the order of the stages.
+        pub fn options() -> Vec<OptionInfo> {
+            let defaults = Recipe::default();
+            vec![$($(OptionInfo {
+                key: concat!(stringify!($group), ".", stringify!($key)),
+                unit: $unit,
+                default: serde_json::to_value(&defaults.$group.$key).unwrap_or(Value::Null),
+                range: $range,
+                doc: [$($doc.trim()),*].join(" "),
+            },)*)*]
+        }
+
+        impl Recipe {
+            fn value_of(&self, key: &str) -> Option<Value> {
+                match key {
+                    $($(concat!(stringify!($group), ".", stringify!($key)) =>
+                        serde_json::to_value(&self.$group.$key).ok(),)*)*
+                    _ => None,
+                }
+            }
+
+            fn put(&mut self, key: &str, value: Value) -> std::result::Result<(), serde_json::Error> {
+                match key {
+                    $($(concat!(stringify!($group), ".", stringify!($key)) => {
+                        self.$group.$key = serde_json::from_value(value)?;
+                    })*)*
+                    _ => {}
+                }
+                Ok(())
+            }
+        }
+    };
+}
+
+recipe! {
+    /// How the laser line is found in a frame (METHOD.md, "Spot centroid").
+    stripe: StripeOptions {
+        /// Centre of the laser's hue range, relative to the laser colour's own (green 75, red 177, blue 115;
+        /// OpenCV's half degrees). Change it for a laser of unusual wavelength or a camera with a strong tint.
+        hue_shift: f64 = 0.0, "OpenCV hue", number(-90.0, 90.0);
+        /// Half the width of the hue range. Wider finds the line on tinted walls, and more of other lights.
+        hue_half_range: f64 = 25.0, "OpenCV hue", number(2.0, 90.0);
+        /// Least saturation of a pixel of the laser's colour.
+        saturation_min: f64 = 70.0, "of 255", number(0.0, 255.0);
+        /// Least brightness (HSV value) of a pixel of the laser's colour.
+        value_min: f64 = 60.0, "of 255", number(0.0, 255.0);
+        /// Width of the dilation that joins the two coloured fringes over a clipped white core.
+        dilate_width_px: u32 = 30, "px", whole(1, 400);
+        /// Height of that dilation.
+        dilate_height_px: u32 = 1, "px", whole(1, 400);
+        /// Width of the erosion that shrinks the area. Wider than the dilation plus the line, it removes the line.
+        erode_width_px: u32 = 20, "px", whole(1, 400);
+        /// Height of that erosion: coloured areas shorter than this along the line are dropped.
+        erode_height_px: u32 = 50, "px", whole(1, 400);
+        /// Give the surviving area the height back that the erosion took from its ends (an opening along the
+        /// line), so that a line keeps its rows next to a gap.
+        restore_height: bool = true, "", flag();
+        /// K of equation (9): the row's threshold between its average (0) and its maximum (1).
+        k: f64 = 0.9, "", number(0.5, 0.99);
+        /// Write the stripes of every frame to `stripes.npy`.
+        keep: bool = false, "", flag();
+    }
+    /// How the image's motion is found (METHOD.md, "Image motion").
+    motion: MotionOptions {
+        /// Number of Harris corners that are followed from each frame to the next.
+        corners: u32 = 100, "", whole(8, 2000);
+        /// Least corner measure, as a share of the best corner's.
+        corner_quality: f64 = 0.001, "", number(0.00001, 0.5);
+        /// Least distance between two corners.
+        corner_distance_px: f64 = 12.0, "px", number(1.0, 200.0);
+        /// Half the width of the band around the line in which no corner is taken.
+        band_half_width_px: f64 = 40.0, "px", number(2.0, 1000.0);
+        /// Side of the Lucas-Kanade window.
+        window_px: u32 = 21, "px", whole(5, 101);
+        /// Levels of the image pyramid above the full image: each doubles the largest motion that is followed.
+        pyramid_levels: u32 = 4, "", whole(0, 8);
+        /// Window of the median filter over the corners' shifts before their mean.
+        median_window: u32 = 3, "", whole(1, 99);
+        /// The scale product's slow part is what a window of this length averages; it is removed.
+        scale_window_s: f64 = 2.0, "s", number(0.1, 60.0);
+        /// Correct each frame's depths by the carried scale (METHOD.md, "Jitter and the depth image").
+        scale_correction: bool = true, "", flag();
+    }
+    /// The maps.
+    map: MapOptions {
+        /// Map tiles held in memory; older ones wait on disk.
+        tiles_in_memory: u32 = 128, "", whole(16, 100000);
+    }
+    /// The rerun recording.
+    recording: RecordingOptions {
+        /// Largest size of the recording: past it, images and points become sparser, never the plots.
+        budget_mb: f64 = 200.0, "MB", number(5.0, 2000.0);
+        /// Width of the recorded images.
+        image_width_px: u32 = 640, "px", whole(64, 4096);
+        /// Images a second of the run.
+        images_per_s: f64 = 5.0, "1/s", number(0.1, 240.0);
+        /// Surface points recorded of each profile, at most.
+        points_per_profile: u32 = 240, "", whole(8, 8192);
+        /// Longest time between two live segments.
+        segment_s: f64 = 1.0, "s", number(0.1, 60.0);
+    }
+    /// Limits of what a source may ask for.
+    limits: LimitOptions {
+        /// Most frames of one run: five hours at 60 frames a second.
+        max_frames: u32 = 1_080_000, "frames", whole(1, 100_000_000);
+    }
+}
+
+impl Recipe {
+    /// A built-in recipe by name.
+    pub fn built_in(name: &str) -> Option<Recipe> {
+        match name {
+            "paper" => Some(Recipe::default()),
+            "paper-literal" => {
+                let mut recipe = Recipe::default();
+                recipe.stripe.erode_width_px = 50;
+                recipe.stripe.restore_height = false;
+                Some(recipe)
+            }
+            _ => None,
+        }
+    }
+
+    /// A built-in recipe by name, or a TOML file by path.
+    pub fn load(name_or_path: &str) -> Result<Recipe> {
+        if let Some(recipe) = Recipe::built_in(name_or_path) {
+            return Ok(recipe);
+        }
+        let path = std::path::Path::new(name_or_path);
+        if !path.exists() {
+            return Err(Error::input(
+                format!("recipe '{name_or_path}'"),
+                "neither a built-in recipe nor a file",
+                format!("one of {}, or the path of a TOML file", BUILT_IN.join(", ")),
+            ));
+        }
+        let text = std::fs::read_to_string(path).map_err(|e| Error::io(path, e))?;
+        Recipe::from_toml(name_or_path, &text)
+    }
+
+    /// Reads and checks a recipe from TOML text; `subject` names it in errors.
+    pub fn from_toml(subject: &str, text: &str) -> Result<Recipe> {
+        let recipe: Recipe = toml::from_str(text)
+            .map_err(|e| Error::input(subject, e.to_string(), "recipe keys as `stria process --help` lists them"))?;
+        recipe.check(subject)?;
+        Ok(recipe)
+    }
+
+    /// The whole recipe as TOML that [`Recipe::from_toml`] reads back.
+    pub fn to_toml(&self) -> String {
+        toml::to_string(self).unwrap_or_else(|e| unreachable!("a recipe is plain tables and numbers: {e}"))
+    }
+
+    /// Changes one value, as `--set key=value` does.
+    pub fn set(&mut self, key: &str, text: &str) -> Result<()> {
+        if key == "method" {
+            self.method = serde_json::from_value(Value::from(text))
+                .map_err(|_| Error::field("--set", key, format!("'{text}'"), "paper"))?;
+            return Ok(());
+        }
+        let Some(option) = options().into_iter().find(|o| o.key == key) else {
+            return Err(Error::input(format!("--set {key}={text}"), format!("no option '{key}'"), nearest_keys(key)));
+        };
+        let expected = option.expected();
+        let value = option
+            .parse(text)
+            .ok_or_else(|| Error::field("--set", key, format!("'{text}'"), expected.clone()))?;
+        option.check("--set", &value)?;
+        self.put(key, value).map_err(|_| Error::field("--set", key, format!("'{text}'"), expected))
+    }
+
+    /// Every value within its range, or the first that is not.
+    pub fn check(&self, subject: &str) -> Result<()> {
+        for option in options() {
+            option.check(subject, &self.value_of(option.key).unwrap_or(Value::Null))?;
+        }
+        Ok(())
+    }
+}
+
+impl OptionInfo {
+    fn expected(&self) -> String {
+        match &self.range {
+            Range::Number { min, max, whole } => {
+                let kind = if *whole { "a whole number" } else { "a number" };
+                format!("{kind} from {min} to {max} {}", self.unit).trim_end().to_string()
+            }
+            Range::Flag => "true or false".into(),
+            Range::Choice { of } => format!("one of {}", of.join(", ")),
+        }
+    }
+
+    fn parse(&self, text: &str) -> Option<Value> {
+        match &self.range {
+            Range::Number { whole: true, .. } => text.parse::<u64>().ok().map(Value::from),
+            Range::Number { .. } => text.parse::<f64>().ok().map(Value::from),
+            Range::Flag => text.parse::<bool>().ok().map(Value::from),
+            Range::Choice { .. } => Some(Value::from(text)),
+        }
+    }
+
+    fn check(&self, subject: &str, value: &Value) -> Result<()> {
+        let fits = match &self.range {
+            Range::Number { min, max, .. } => value.as_f64().is_some_and(|v| v >= *min && v <= *max),
+            Range::Flag => value.is_boolean(),
+            Range::Choice { of } => value.as_str().is_some_and(|v| of.contains(&v)),
+        };
+        if fits {
+            return Ok(());
+        }
+        Err(Error::field(subject, self.key, format!("{value} {}", self.unit).trim_end(), self.expected()))
+    }
+}
+
+fn nearest_keys(key: &str) -> String {
+    let group = key.split('.').next().unwrap_or_default();
+    let options = options();
+    let near: Vec<_> = options.iter().map(|o| o.key).filter(|k| k.split('.').next() == Some(group)).collect();
+    if near.is_empty() {
+        let groups: std::collections::BTreeSet<_> = options.iter().filter_map(|o| o.key.split('.').next()).collect();
+        return format!("a key of one of the groups {}", groups.into_iter().collect::<Vec<_>>().join(", "));
+    }
+    format!("one of {}", near.join(", "))
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn built_in_recipes_are_sound_and_survive_toml() {
+        for name in BUILT_IN {
+            let recipe = Recipe::load(name).expect("built in");
+            recipe.check(name).expect("in range");
+            assert_eq!(Recipe::from_toml(name, &recipe.to_toml()).expect("toml"), recipe);
+        }
+    }
+
+    #[test]
+    fn every_option_has_words_and_a_default_in_range() {
+        for option in options() {
+            assert!(option.doc.len() > 20, "{} needs a reason", option.key);
+            option.check("default", &option.default).expect("default in range");
+        }
+    }
+
+    #[test]
+    fn values_out_of_range_and_unknown_keys_are_named() {
+        let mut recipe = Recipe::default();
+        recipe.set("stripe.k", "0.8").expect("in range");
+        assert_eq!(recipe.stripe.k, 0.8);
+        for (key, value, part) in [
+            ("stripe.k", "7", "0.5 to 0.99"),
+            ("stripe.k", "much", "a number"),
+            ("stripe.kk", "1", "stripe.hue_shift"),
+            ("nothing", "1", "groups"),
+            ("stripe.keep", "yes", "true or false"),
+            ("motion.corners", "10.5", "whole"),
+        ] {
+            let message = recipe.set(key, value).expect_err(key).to_string();
+            assert!(message.contains(part), "{message}");
+        }
+        assert!(Recipe::from_toml("r.toml", "[stripe]\nkk = 1").is_err());
+        assert!(Recipe::from_toml("r.toml", "[stripe]\nk = 2.0").is_err());
+    }
+}

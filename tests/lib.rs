@@ -1,0 +1,1 @@
+//! Stria from outside. The tests live beside this file, one file per concern.
