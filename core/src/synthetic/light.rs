@@ -96,9 +96,11 @@ impl<'a> FrameView<'a> {
             let p: [f32; 3] = std::array::from_fn(|i| self.position[i] + d[i] * depth);
             (p, self.ground.sample(p[0], p[1]))
         };
-        let depth_mm = if self.has_steps { self.march(&d, at) } else { newton(&d, guess_mm, at) };
+        let nearby = if self.has_steps { None } else { newton(&d, guess_mm, at) };
+        let depth_mm = nearby.unwrap_or_else(|| self.march(&d, at));
         let (point, sample) = at(depth_mm);
-        (point[1].abs() <= self.y_limit_mm).then(|| {
+        let met = (sample[0] - point[2]).abs() < MET_MM && point[1].abs() <= self.y_limit_mm;
+        met.then(|| {
             let n = &self.plane;
             let from_plane_mm = depth_mm * (n[0] * x + n[1] * y + n[2]) - n[3];
             Hit { depth_mm, point, sample, from_plane_mm }
@@ -219,8 +221,11 @@ impl<'a> FrameView<'a> {
     }
 }
 
-/// Newton's method with the baked slope, from a neighbour's depth: one or two steps.
-fn newton(d: &[f32; 3], guess_mm: f32, at: impl Fn(f32) -> ([f32; 3], Sample)) -> f32 {
+/// A ray has met the surface when it is so near, mm; a block's flank is baked about this steep.
+const MET_MM: f32 = 1.0;
+
+/// Newton's method with the baked slope, from a neighbour's depth: one or two steps. `None`: it leads nowhere.
+fn newton(d: &[f32; 3], guess_mm: f32, at: impl Fn(f32) -> ([f32; 3], Sample)) -> Option<f32> {
     let mut depth = guess_mm;
     for _ in 0..8 {
         let (p, s) = at(depth);
@@ -228,10 +233,10 @@ fn newton(d: &[f32; 3], guess_mm: f32, at: impl Fn(f32) -> ([f32; 3], Sample)) -
         let step = miss / (d[2] - s[1] * d[0] - s[2] * d[1]).max(0.3);
         depth += step;
         if step.abs() < 0.01 {
-            break;
+            return Some(depth);
         }
     }
-    depth
+    None
 }
 
 fn dot(a: &[f32; 3], b: &[f32; 3]) -> f32 {

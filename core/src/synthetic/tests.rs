@@ -24,21 +24,19 @@ fn ffmpeg(program: &str, arguments: &[&str], file: &std::path::Path) -> Vec<u8> 
     output.stdout
 }
 
-/// The centroid of the laser's own channel in linear light, without the ambient level: no estimator of ours.
+/// A centroid of the stored green above its level beside the line: no estimator of the product's.
 fn centroid(image: &Image, rig: &Rig, position: usize, near_px: f64) -> f64 {
-    let linear = |v: u8| {
-        let v = f64::from(v) / 255.0;
-        if v <= 0.04045 { v / 12.92 } else { ((v + 0.055) / 1.055).powf(2.4) }
-    };
     let width = image.width_px() as usize;
-    let at = |across: usize| match rig.laser.line {
-        LineDirection::Vertical => 3 * (position * width + across) + 1,
-        LineDirection::Horizontal => 3 * (across * width + position) + 1,
+    let green = |across: usize| {
+        let pixel = match rig.laser.line {
+            LineDirection::Vertical => position * width + across,
+            LineDirection::Horizontal => across * width + position,
+        };
+        f64::from(image.bgr()[3 * pixel + 1])
     };
     let centre = near_px.round() as usize;
-    let level = linear(image.bgr()[at(centre - 20)]);
-    let window = centre - 16..=centre + 16;
-    let weights: Vec<(f64, f64)> = window.map(|a| (a as f64, linear(image.bgr()[at(a)]) - level)).collect();
+    let level = green(centre - 20);
+    let weights: Vec<(f64, f64)> = (centre - 13..=centre + 13).map(|a| (a as f64, green(a) - level)).collect();
     weights.iter().map(|(a, w)| a * w).sum::<f64>() / weights.iter().map(|(_, w)| w).sum::<f64>()
 }
 
@@ -67,13 +65,16 @@ fn the_true_line_triangulates_onto_the_true_surface() {
             worst_mm = worst_mm.max((z - world.z).abs());
             seen += 1;
         }
-        assert!(seen * 10 >= truth.stripe_across_px.len() * 9, "{name} {line:?}: only {seen} line positions");
+        // A wide view sees past the pipe on both sides.
+        let share = if (name, line) == ("pipe", LineDirection::Horizontal) { 0.6 } else { 1.0 };
+        assert!(seen as f64 >= share * truth.stripe_across_px.len() as f64, "{name} {line:?}: {seen} line positions");
         assert!(worst_mm < 1e-3, "{name} {line:?}: {worst_mm} mm off the surface");
     }
 }
 
 #[test]
 fn the_exact_image_shows_the_line_at_its_true_place() {
+    let mut all = Vec::new();
     for (name, line) in [
         ("wall", LineDirection::Vertical),
         ("pipe", LineDirection::Vertical),
@@ -88,20 +89,24 @@ fn the_exact_image_shows_the_line_at_its_true_place() {
                 .stripe_across_px
                 .iter()
                 .enumerate()
-                .map(|(i, a)| (centroid(&image, simulation.rig(), i, f64::from(*a)) - f64::from(*a)).abs())
+                .map(|(i, a)| centroid(&image, simulation.rig(), i, f64::from(*a)) - f64::from(*a))
                 .collect();
-            misses.sort_by(f64::total_cmp);
-            let (middle, worst) = (misses[misses.len() / 2], misses[misses.len() - 1]);
-            assert!(middle < 0.003 && worst < 0.01, "{name} {line:?}: median {middle} px, worst {worst} px");
+            all.extend(&misses);
+            misses.sort_by(|a, b| a.abs().total_cmp(&b.abs()));
+            let at = |share: usize| misses[(misses.len() - 1) * share / 100].abs();
+            // Rounding to 8 bits leaves some 0.005 px.
+            assert!(at(50) < 0.01 && at(95) < 0.02 && at(100) < 0.03, "{name} {line:?}: {} {} {} px", at(50), at(95), at(100));
         }
     }
+    let mean = all.iter().sum::<f64>() / all.len() as f64;
+    assert!(mean.abs() < 0.002, "{mean} px of bias");
 }
 
 #[test]
 fn the_rendered_fan_agrees_with_the_solved_line() {
     // The fan's light comes from the baked surface, the truth from the exact one. On a lens and curved relief.
     let mut scene = Scene::named("lens").expect("lens").exact();
-    scene.laser.profile = LineProfile::Fan { sigma_mm: 3.5 };
+    scene.laser.profile = LineProfile::Fan { sigma_mm: 3.0 };
     let simulation = simulation(scene);
     let (image, truth) = simulation.render(3);
     for (row, across) in truth.stripe_across_px.iter().enumerate() {
@@ -161,26 +166,42 @@ fn standing_still_shows_the_same_wall() {
 }
 
 #[test]
+fn beside_a_pipe_is_nothing() {
+    let scene = Scene { line: LineDirection::Horizontal, noise: None, ..Scene::named("pipe").expect("pipe") };
+    let simulation = simulation(scene);
+    let (image, truth) = simulation.render(4);
+    // From where the line ends to the image's rim, with room for the pipe's roll and nearer parts.
+    let seen = |a: &f32| a.is_finite();
+    let first = truth.stripe_across_px.iter().position(seen).expect("a line");
+    let last = truth.stripe_across_px.iter().rposition(seen).expect("a line");
+    assert!(first > 60 && last < 580, "{first} to {last}");
+    for row in image.bgr().chunks_exact(3 * 640) {
+        let bright = |columns: std::ops::Range<usize>| row[3 * columns.start..3 * columns.end].iter().any(|v| *v > 20);
+        assert!(!bright(0..first - 20) && !bright(last + 20..640));
+    }
+}
+
+#[test]
 fn no_laser_has_no_line() {
     let (_, truth) = simulation(Scene::named("no-laser").expect("scene")).render(0);
     assert!(truth.stripe_across_px.iter().all(|a| a.is_nan()) && truth.measurable.iter().all(|m| !m));
 }
 
 #[test]
-fn a_highlight_washes_the_line_out_and_a_block_hides_it() {
+fn a_highlight_washes_the_line_out_and_a_block_moves_it() {
     let (_, pipe) = simulation(Scene::named("pipe").expect("pipe")).render(0);
     let washed = pipe.measurable.iter().filter(|m| !**m).count();
     assert!(washed > 3 && washed < pipe.measurable.len() / 4, "{washed} positions");
-    // Rows that look past a block's lower edge see plate and line behind it; a turned camera loses some of them.
     let gauge = simulation(Scene::named("step-gauge").expect("gauge"));
-    let (_, truth) = gauge.render(0);
-    let deepest = |y: f64| {
+    // After 12 frames the line lies across the blocks.
+    let (_, truth) = gauge.render(12);
+    let line_at = |y: f64| {
         let row = gauge.rig().camera.project(&Point3::new(0.0, y, 450.0)).v_px.round() as usize;
         truth.stripe_across_px[row]
     };
     // 20 mm of height move the line by C1·(1/430 − 1/450).
     let expected = gauge.rig().camera.fx_px * 150.0 * (1.0 / 430.0 - 1.0 / 450.0);
-    let moved = f64::from(deepest(90.0) - deepest(67.0));
+    let moved = f64::from(line_at(90.0) - line_at(67.0));
     assert!((moved - expected).abs() < 0.01, "{moved} px, expected {expected} px");
 }
 
