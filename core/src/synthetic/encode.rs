@@ -130,7 +130,7 @@ fn open_encoder(
         Quality::Camera => {
             encoder.set_format(Pixel::YUV420P);
             for (key, value) in [
-                ("preset", "fast"),
+                ("preset", "veryfast"),
                 ("crf", "18"),
                 ("colorspace", "bt709"),
                 ("color_primaries", "bt709"),
