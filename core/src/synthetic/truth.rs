@@ -79,7 +79,7 @@ impl LineFinder<'_> {
     /// The exact place between two neighbouring pixels; `None` where the surface jumps over the laser's plane
     /// or where the laser does not reach it.
     fn refine(&self, position: usize, across: usize) -> Option<LinePoint> {
-        let from_plane_mm = |a: f64| self.from_plane_mm(position, a).unwrap_or(f64::NAN);
+        let from_plane_mm = |a: f64| self.away_from_plane_mm(position, a).unwrap_or(f64::NAN);
         let at = |a: f64| (a, from_plane_mm(a));
         let (mut low, mut high) = (at(across as f64), at(across as f64 + 1.0));
         // The baked surface may differ by a hair from the true one.
@@ -128,7 +128,7 @@ impl LineFinder<'_> {
         first_hit(self.window, self.pose, direction_in_camera, self.z_near_mm)
     }
 
-    fn from_plane_mm(&self, position: usize, across: f64) -> Option<f64> {
+    fn away_from_plane_mm(&self, position: usize, across: f64) -> Option<f64> {
         let direction = self.rig.camera.undistort(self.pixel(position, across)).direction();
         let plane = &self.rig.laser.plane;
         self.depth_mm(&direction).map(|depth| depth * plane.normal.dot(&direction) - plane.offset_mm)
