@@ -3,6 +3,8 @@
 //! The grid has no edges while the run goes on: a robot may go back past its start. Tiles that were not
 //! touched for long wait in a scratch file, so a long run needs no more memory than a short one.
 
+pub mod strips;
+
 use std::collections::HashMap;
 use std::fs::File;
 use std::os::unix::fs::FileExt;
