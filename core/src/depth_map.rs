@@ -5,7 +5,7 @@
 
 pub mod strips;
 
-use std::collections::HashMap;
+use std::collections::{HashMap, HashSet};
 use std::fs::File;
 use std::os::unix::fs::FileExt;
 use std::path::Path;
@@ -49,6 +49,46 @@ pub struct MapWindow {
     pub texture: Vec<Option<[u8; 3]>>,
 }
 
+impl MapWindow {
+    /// A window in which nothing was measured.
+    pub fn empty(width_px: usize, height_px: usize) -> MapWindow {
+        let size = width_px * height_px;
+        MapWindow { width_px, height_px, depth_mm: vec![f32::NAN; size], texture: vec![None; size] }
+    }
+}
+
+/// A map that can be read in rectangles, however large it is: what the exports read from.
+pub trait MapReader {
+    /// Where the map lies and how large it is.
+    fn geometry(&self) -> MapGeometry;
+
+    /// Reads a rectangle of the map; what lies outside is empty.
+    fn window(&mut self, column_px: usize, row_px: usize, width_px: usize, height_px: usize) -> Result<MapWindow>;
+}
+
+/// A map in which something was measured, for reading.
+pub struct FinishedMap<'a> {
+    map: &'a mut SurfaceMap,
+    geometry: MapGeometry,
+}
+
+impl FinishedMap<'_> {
+    /// Share of the map's pixels that have a depth, 0 to 1.
+    pub fn coverage(&self) -> f64 {
+        self.map.measured as f64 / (self.geometry.width_px * self.geometry.height_px) as f64
+    }
+}
+
+impl MapReader for FinishedMap<'_> {
+    fn geometry(&self) -> MapGeometry {
+        self.geometry
+    }
+
+    fn window(&mut self, column_px: usize, row_px: usize, width_px: usize, height_px: usize) -> Result<MapWindow> {
+        self.map.window(column_px, row_px, width_px, height_px)
+    }
+}
+
 /// How the grid lies in the world: the centre of grid pixel (0, 0) and the pixel's size.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct Grid {
@@ -69,6 +109,7 @@ pub struct SurfaceMap {
     scratch: File,
     scratch_path: std::path::PathBuf,
     slots: HashMap<TileIndex, u64>,
+    changed: HashSet<TileIndex>,
     /// Bounds of the measured pixels on the grid: columns and rows, both ends included.
     bounds: Option<([i64; 2], [i64; 2])>,
     measured: u64,
@@ -99,6 +140,7 @@ impl SurfaceMap {
             scratch,
             scratch_path: scratch_dir.to_path_buf(),
             slots: HashMap::new(),
+            changed: HashSet::new(),
             bounds: None,
             measured: 0,
         })
@@ -111,6 +153,7 @@ impl SurfaceMap {
         let was_empty = tile.depth_mm[at].is_nan();
         tile.depth_mm[at] = depth_mm;
         tile.dirty = true;
+        self.changed.insert(index);
         self.measured += u64::from(was_empty);
         let (columns, rows) = self.bounds.get_or_insert(([column, column], [row, row]));
         *columns = [columns[0].min(column), columns[1].max(column)];
@@ -125,17 +168,31 @@ impl SurfaceMap {
         if replace || tile.texture[at][3] == 0 {
             tile.texture[at] = [rgb[0], rgb[1], rgb[2], 1];
             tile.dirty = true;
+            self.changed.insert(index);
         }
         Ok(())
     }
 
-    /// Number of pixels with a depth.
-    pub fn measured_px(&self) -> u64 {
-        self.measured
+    /// The map as it is now, for reading; `None` where nothing was measured.
+    pub fn finished(&mut self) -> Option<FinishedMap<'_>> {
+        let geometry = self.geometry()?;
+        Some(FinishedMap { map: self, geometry })
+    }
+
+    /// The tiles that changed since this was last asked.
+    pub fn take_changed(&mut self) -> Vec<TileIndex> {
+        self.changed.drain().collect()
+    }
+
+    /// A whole tile of the grid.
+    pub fn tile_window(&mut self, index: TileIndex) -> Result<MapWindow> {
+        let mut window = MapWindow::empty(TILE_SIDE_PX, TILE_SIDE_PX);
+        copy_part(self.tile(index)?, (0, 0), &mut window);
+        Ok(window)
     }
 
     /// The rectangle of the measured pixels; `None` where nothing was measured.
-    pub fn geometry(&self) -> Option<MapGeometry> {
+    fn geometry(&self) -> Option<MapGeometry> {
         let (columns, rows) = self.bounds?;
         Some(MapGeometry {
             x0_mm: self.grid.x_mm + columns[0] as f64 * self.grid.mm_per_px,
@@ -147,9 +204,8 @@ impl SurfaceMap {
     }
 
     /// Reads a rectangle of [`SurfaceMap::geometry`]; what lies outside the measured tiles is empty.
-    pub fn window(&mut self, column_px: usize, row_px: usize, width_px: usize, height_px: usize) -> Result<MapWindow> {
-        let size = width_px * height_px;
-        let mut window = MapWindow { width_px, height_px, depth_mm: vec![f32::NAN; size], texture: vec![None; size] };
+    fn window(&mut self, column_px: usize, row_px: usize, width_px: usize, height_px: usize) -> Result<MapWindow> {
+        let mut window = MapWindow::empty(width_px, height_px);
         let Some((columns, rows)) = self.bounds else { return Ok(window) };
         let (left, top) = (columns[0] + column_px as i64, rows[0] + row_px as i64);
         let side = TILE_SIDE_PX as i64;
@@ -278,7 +334,7 @@ mod tests {
             assert_eq!(window.texture[at(0)], Some([(column & 255) as u8, 2, 3]));
             assert_eq!(window.texture[at(-3)], None);
         }
-        assert_eq!(map.measured_px(), 3 * 3700);
+        assert_eq!(map.measured, 3 * 3700);
         assert!(map.tiles.len() <= 4);
     }
 

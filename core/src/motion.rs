@@ -50,6 +50,25 @@ pub struct Shift {
     pub corners: Vec<TrackedCorner>,
 }
 
+impl Shift {
+    /// How far the camera moved along world x since the previous frame, px of the image (lib.rs says how the
+    /// world lies); 0 where tracking was lost.
+    pub fn travel_px(&self, line: LineDirection) -> f64 {
+        match line {
+            LineDirection::Vertical => -self.dx_px.unwrap_or(0.0),
+            LineDirection::Horizontal => -self.dy_px.unwrap_or(0.0),
+        }
+    }
+
+    /// The same along world y.
+    pub fn across_px(&self, line: LineDirection) -> f64 {
+        match line {
+            LineDirection::Vertical => -self.dy_px.unwrap_or(0.0),
+            LineDirection::Horizontal => self.dx_px.unwrap_or(0.0),
+        }
+    }
+}
+
 /// Follows the image from frame to frame; holds the previous frame only.
 pub struct ImageTracker {
     options: MotionOptions,

@@ -184,6 +184,8 @@ recipe! {
     map: MapOptions {
         /// Map tiles held in memory; older ones wait on disk.
         tiles_in_memory: u32 = 128, "", whole(16, 100000);
+        /// Frames after which changed tiles are written while the run goes on.
+        tile_frames: u32 = 120, "frames", whole(1, 100000);
     }
     /// The rerun recording.
     recording: RecordingOptions {

@@ -47,6 +47,13 @@ impl Stripe {
         })
     }
 
+    /// The median of `across_px`; `None` where nothing was found.
+    pub fn median_px(&self) -> Option<f64> {
+        let mut found: Vec<f32> = self.across_px.iter().copied().filter(|x| x.is_finite()).collect();
+        let middle = found.len() / 2;
+        (!found.is_empty()).then(|| f64::from(*found.select_nth_unstable_by(middle, f32::total_cmp).1))
+    }
+
     /// The least and the greatest `across_px`; `None` where nothing was found.
     pub fn extent_px(&self) -> Option<(f32, f32)> {
         let found = self.across_px.iter().copied().filter(|x| x.is_finite());

@@ -136,12 +136,7 @@ impl<T> Placement<T> {
     /// Carries the travel on by one frame. A lost frame keeps its place: a gap is declared, not bridged.
     fn advance(&mut self, measured: &Measured<T>) {
         self.last_z_mm = measured.profile.median_z_mm().or(self.last_z_mm);
-        let (Some(dx), Some(dy)) = (measured.shift.dx_px, measured.shift.dy_px) else { return };
-        // World x is the image's x for a vertical line and its y for a horizontal one (lib.rs).
-        let (travel, across) = match self.line {
-            LineDirection::Vertical => (-dx, -dy),
-            LineDirection::Horizontal => (-dy, dx),
-        };
+        let (travel, across) = (measured.shift.travel_px(self.line), measured.shift.across_px(self.line));
         self.travel_px += travel;
         self.across_px += across;
         self.last_step_px = travel;

@@ -43,6 +43,15 @@ impl TextureStrip {
     }
 }
 
+impl TextureStrip {
+    /// The wall's colour beside the line at a line position; mid gray where the image does not reach.
+    pub fn beside(&self, line_position: u32) -> [u8; 3] {
+        let at = line_position as usize * self.columns + (-self.first) as usize;
+        let colour = |side: &[Option<[u8; 3]>]| side.get(at).copied().flatten();
+        colour(&self.ahead).or_else(|| colour(&self.behind)).unwrap_or([128; 3])
+    }
+}
+
 /// The colour at an image position given along the travel and along the line.
 fn pixel(image: &Image, line: LineDirection, travel: i64, row: usize) -> Option<[u8; 3]> {
     let (column, row) = match line {
@@ -75,8 +84,13 @@ pub fn strip_grid(rig: &Rig, z_mm: f64, line_x_mm: f64) -> Grid {
     }
 }
 
-/// Puts a placed frame on the map.
-pub fn add_strip(map: &mut SurfaceMap, line: LineDirection, placed: &Placed<Option<TextureStrip>>) -> Result<()> {
+/// Puts a placed frame, with its colours where it has them, on the map.
+pub fn add_strip<T>(
+    map: &mut SurfaceMap,
+    line: LineDirection,
+    placed: &Placed<T>,
+    texture: Option<&TextureStrip>,
+) -> Result<()> {
     let start = placed.travel_px.round() as i64;
     let end = placed.travel_end_px.round() as i64;
     let across = placed.across_px.round() as i64;
@@ -93,7 +107,7 @@ pub fn add_strip(map: &mut SurfaceMap, line: LineDirection, placed: &Placed<Opti
             map.put_depth(column, grid_row(i64::from(point.line_position)), depth_mm)?;
         }
     }
-    let Some(strip) = &placed.measured.cargo else { return Ok(()) };
+    let Some(strip) = texture else { return Ok(()) };
     for column in low..high {
         let k = column - start - strip.first;
         if k < 0 || k >= strip.columns as i64 {
@@ -157,7 +171,8 @@ mod tests {
         let mut map =
             SurfaceMap::create(strip_grid(&rig, 400.0, 50.0), 8, &std::env::temp_dir()).expect("map");
         for frame in 0..20 {
-            add_strip(&mut map, LineDirection::Vertical, &placed(f64::from(frame) * 3.0, 3.0, frame)).expect("strip");
+            let placed = placed(f64::from(frame) * 3.0, 3.0, frame);
+            add_strip(&mut map, LineDirection::Vertical, &placed, placed.measured.cargo.as_ref()).expect("strip");
         }
         let geometry = map.geometry().expect("measured");
         assert_eq!((geometry.width_px, geometry.height_px), (60, 64));
@@ -179,7 +194,8 @@ mod tests {
         let mut map =
             SurfaceMap::create(strip_grid(&rig, 400.0, 50.0), 8, &std::env::temp_dir()).expect("map");
         for frame in 0..5 {
-            add_strip(&mut map, LineDirection::Vertical, &placed(0.0, 0.0, frame)).expect("strip");
+            let placed = placed(0.0, 0.0, frame);
+            add_strip(&mut map, LineDirection::Vertical, &placed, placed.measured.cargo.as_ref()).expect("strip");
         }
         assert_eq!(map.geometry().expect("measured").width_px, 1);
     }
