@@ -4,6 +4,10 @@ use serde::{Deserialize, Serialize};
 
 use crate::error::Result;
 
+mod grid;
+
+pub use grid::GridMap;
+
 /// Side of a map tile, px.
 pub const TILE_SIDE_PX: usize = 256;
 
@@ -35,6 +39,25 @@ pub struct MapWindow {
     pub texture: Vec<Option<[u8; 3]>>,
 }
 
+impl MapWindow {
+    /// A window in which nothing was measured.
+    pub fn empty(width_px: usize, height_px: usize) -> MapWindow {
+        let size = width_px * height_px;
+        MapWindow { width_px, height_px, depth_mm: vec![f32::NAN; size], texture: vec![None; size] }
+    }
+}
+
+/// A map that can be read in rectangles, however large it is: what the exports read from.
+///
+/// A caller that wants progress or a way to stop wraps its map and counts, or refuses, the windows.
+pub trait MapReader {
+    /// Where the map lies and how large it is.
+    fn geometry(&self) -> MapGeometry;
+
+    /// Reads a rectangle of the map; what lies outside is empty.
+    fn window(&mut self, column_px: usize, row_px: usize, width_px: usize, height_px: usize) -> Result<MapWindow>;
+}
+
 /// The depth map and the texture map of a run, on one grid.
 pub struct SurfaceMap {
     geometry: MapGeometry,
@@ -51,5 +74,15 @@ impl SurfaceMap {
         let _ = (column_px, row_px);
         let size = width_px * height_px;
         Ok(MapWindow { width_px, height_px, depth_mm: vec![f32::NAN; size], texture: vec![None; size] })
+    }
+}
+
+impl MapReader for SurfaceMap {
+    fn geometry(&self) -> MapGeometry {
+        SurfaceMap::geometry(self)
+    }
+
+    fn window(&mut self, column_px: usize, row_px: usize, width_px: usize, height_px: usize) -> Result<MapWindow> {
+        SurfaceMap::window(self, column_px, row_px, width_px, height_px)
     }
 }
