@@ -3,6 +3,7 @@
 //! The grid has no edges while the run goes on: a robot may go back past its start. Tiles that were not
 //! touched for long wait in a scratch file, so a long run needs no more memory than a short one.
 
+mod grid;
 pub mod strips;
 
 use std::collections::{HashMap, HashSet};
@@ -13,6 +14,8 @@ use std::path::Path;
 use serde::{Deserialize, Serialize};
 
 use crate::error::{Error, Result};
+
+pub use grid::GridMap;
 
 /// Side of a map tile, px.
 pub const TILE_SIDE_PX: usize = 256;

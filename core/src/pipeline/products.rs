@@ -88,8 +88,9 @@ impl<'a> Products<'a> {
         let (measured, cargo) = (&placed.measured, &placed.measured.cargo);
         self.frames += 1;
         let points = surface_points(placed);
+        let line = self.request.rig.laser.line;
         if let Some(map) = self.map_for(placed)? {
-            add_strip(map, self.request.rig.laser.line, placed, cargo.texture.as_ref())?;
+            add_strip(map, line, placed, cargo.texture.as_ref())?;
         }
         if let Some(trajectory) = &mut self.trajectory {
             trajectory.push(&trajectory_row(placed))?;
@@ -99,7 +100,7 @@ impl<'a> Products<'a> {
         }
         if let Some(archive) = &mut self.archive {
             archive.pose(measured.time_s, &placed.world_from_camera)?;
-            archive.profile(measured.time_s, &measured.profile)?;
+            archive.profile(measured.time_s, &measured.profile, &points)?;
             archive.surface(measured.time_s, &points)?;
             archive.measurement(measured.frame, measured.time_s, &cargo.stripe, &measured.shift)?;
         }
@@ -301,8 +302,8 @@ impl<'a> Products<'a> {
         let Some(mut recorder) = self.recorder.take() else { return Ok(()) };
         progress.step("recording")?;
         if let Some(map) = map {
-            let picture = preview::draw(map, &self.preview_text())?;
-            recorder.log_map(picture.width_px as u32, picture.height_px as u32, &picture.rgb)?;
+            let (width_px, height_px, rgb) = preview::picture(map, &self.preview_text())?;
+            recorder.log_map(width_px as u32, height_px as u32, &rgb)?;
         }
         for warning in progress.warnings().to_vec() {
             recorder.log_warning(&warning)?;

@@ -57,10 +57,6 @@ impl QualityCounter {
         }
     }
 
-    /// Points so far.
-    pub(super) fn points(&self) -> u64 {
-        self.quality.points
-    }
 
     /// The figures; `coverage` is the share of map pixels with a depth.
     pub(super) fn finish(self, rig: &Rig, coverage: f64) -> (Quality, Vec<Gap>, Option<Resolution>) {
