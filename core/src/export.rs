@@ -4,9 +4,9 @@
 //! under its final name is ever incomplete. Every writer's memory is bounded whatever the length of the run:
 //! maps are read in windows through [`crate::depth_map::MapReader`].
 
+use crate::error::{Error, Result};
 use std::path::Path;
 use tempfile::NamedTempFile;
-use crate::error::{Error, Result};
 
 pub mod archive_mcap;
 pub mod cloud_ply;
@@ -21,7 +21,6 @@ mod pyramid;
 pub mod texture;
 pub mod tiles;
 pub mod trajectory_csv;
-
 
 /// A temporary file beside `path`, to be persisted there once it is complete; it goes away when it is dropped. It
 /// has the permissions of an ordinary new file.

@@ -285,7 +285,9 @@ fn halved(rgb: &[u8], width_px: u32, height_px: u32) -> Vec<u8> {
         ((at(0, 0) + at(0, 1) + at(1, 0) + at(1, 1) + 2) / 4) as u8
     };
     let rows = 0..height_px as usize / 2;
-    rows.flat_map(|r| (0..columns).flat_map(move |x| (0..3).map(move |c| (r, x, c)))).map(|(r, x, c)| mean(r, x, c)).collect()
+    rows.flat_map(|r| (0..columns).flat_map(move |x| (0..3).map(move |c| (r, x, c))))
+        .map(|(r, x, c)| mean(r, x, c))
+        .collect()
 }
 
 /// rerun's unit in space.

@@ -422,10 +422,7 @@ fn field(name: &str, offset: u32, r#type: NumericType) -> PackedElementField {
 
 /// Not turned, at a position in metres.
 fn pose_at([x, y, z]: [f64; 3]) -> Pose {
-    Pose {
-        position: Some(Vector3 { x, y, z }),
-        orientation: Some(Quaternion { x: 0.0, y: 0.0, z: 0.0, w: 1.0 }),
-    }
+    Pose { position: Some(Vector3 { x, y, z }), orientation: Some(Quaternion { x: 0.0, y: 0.0, z: 0.0, w: 1.0 }) }
 }
 
 /// The schemas' unit of length.

@@ -134,7 +134,8 @@ mod tests {
 
     #[test]
     fn near_is_red_and_far_is_blue() {
-        let at = |z| SurfacePoint { point_in_world: Point3::new(0.0, 0.0, z), rgb: [255; 3], confidence: 1.0, frame: 0 };
+        let at =
+            |z| SurfacePoint { point_in_world: Point3::new(0.0, 0.0, z), rgb: [255; 3], confidence: 1.0, frame: 0 };
         let range = depth_range(&[at(100.0), at(110.0)]);
         assert!(range.near_mm < 100.0 && range.far_mm > 110.0);
         let (near, far) = (colour(&at(range.near_mm), range), colour(&at(range.far_mm), range));
