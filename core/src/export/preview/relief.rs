@@ -113,9 +113,9 @@ fn blurred(values: &[f32], width: usize, height: usize, radii: (usize, usize)) -
 fn slide(line: &mut [f32], radius: usize) {
     let source = line.to_vec();
     let mut sum: f64 = source.iter().take(radius).map(|v| f64::from(*v)).sum();
-    for i in 0..line.len() {
+    for (i, value) in line.iter_mut().enumerate() {
         sum += source.get(i + radius).map_or(0.0, |v| f64::from(*v));
         sum -= i.checked_sub(radius + 1).map_or(0.0, |j| f64::from(source[j]));
-        line[i] = sum as f32;
+        *value = sum as f32;
     }
 }
