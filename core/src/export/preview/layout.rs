@@ -100,7 +100,7 @@ pub(super) fn label(value: f64, step: f64) -> String {
 /// Width and height for people: in mm, or in m from a metre on.
 pub(super) fn size(width_mm: f64, height_mm: f64) -> String {
     match width_mm.max(height_mm) {
-        large if large >= 10_000.0 => format!("{:.1} × {:.1} m", width_mm / 1000.0, height_mm / 1000.0),
+        large if large >= 10_000.0 => format!("{:.1} × {:.2} m", width_mm / 1000.0, height_mm / 1000.0),
         large if large >= 1000.0 => format!("{:.2} × {:.2} m", width_mm / 1000.0, height_mm / 1000.0),
         _ => format!("{width_mm:.0} × {height_mm:.0} mm"),
     }
