@@ -131,6 +131,7 @@ fn trajectory_csv_has_the_contract_s_columns() {
         dy_px: Some(0.5),
         scale: Some(1.000_25),
         world_from_camera: Some(world_from_camera(Vector3::new(6.625, -0.25, 1.5), roll, pitch, yaw)),
+        rotation_determined: true,
         rows_found: 719,
         tracked: 97,
         residual_px: Some(0.0625),

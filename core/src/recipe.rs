@@ -265,9 +265,8 @@ impl Recipe {
             return Err(Error::input(format!("--set {key}={text}"), format!("no option '{key}'"), nearest_keys(key)));
         };
         let expected = option.expected();
-        let value = option
-            .parse(text)
-            .ok_or_else(|| Error::field("--set", key, format!("'{text}'"), expected.clone()))?;
+        let value =
+            option.parse(text).ok_or_else(|| Error::field("--set", key, format!("'{text}'"), expected.clone()))?;
         option.check("--set", &value)?;
         self.put(key, value).map_err(|_| Error::field("--set", key, format!("'{text}'"), expected))
     }

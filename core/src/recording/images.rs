@@ -90,11 +90,7 @@ impl Images {
     /// Whether the frame at this time is one to show.
     pub(super) fn due(&self, time_s: f64, share: &Share) -> bool {
         let Some(last_s) = self.last_s else { return true };
-        let planned = self.duration_expected_s.map_or(0, |duration_s| {
-            let image_bytes = self.shown_bytes as f64 / f64::from(self.shown.max(1));
-            share.halvings_for(duration_s / self.interval_s * image_bytes)
-        });
-        let interval_s = self.interval_s * f64::from(1 << planned.max(share.halvings()).min(30));
+        let interval_s = self.interval_s * f64::from(share.halvings()).exp2();
         // Half a millisecond of grace, so that 5 images a second of a 60 Hz video are every 12th frame.
         time_s - last_s >= interval_s - 0.0005
     }
@@ -116,6 +112,10 @@ impl Images {
         }
         self.shown += 1;
         self.shown_bytes += bytes;
+        if let Some(duration_s) = self.duration_expected_s {
+            let mean_bytes = self.shown_bytes as f64 / f64::from(self.shown);
+            share.plan(duration_s / self.interval_s * mean_bytes);
+        }
 
         let mut chunks = Vec::new();
         for (entity, jpeg) in jpegs {
