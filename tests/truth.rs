@@ -3,7 +3,7 @@
 use stria_core::motion::ImageTracker;
 use stria_core::recipe::Recipe;
 use stria_core::source::Frame;
-use stria_core::stripe;
+use stria_core::stripe::{self, Stripe};
 use stria_core::synthetic::{Motion, Scene, Simulation};
 use stria_core::triangulation::triangulate;
 
@@ -61,15 +61,43 @@ fn measure(scene: Scene, size_px: (u32, u32), seconds: f64, seed: u64) -> Errors
 }
 
 #[test]
-fn without_noise_the_stripe_is_met_to_0_02_px_and_the_depth_to_0_02_mm() {
+fn without_noise_the_stripe_is_met_to_0_02_px() {
     for name in ["wall", "pipe-steady"] {
-        let scene = Scene::named(name).expect("a scene").exact().without_relief();
+        let mut scene = Scene::named(name).expect("a scene").exact().without_relief();
+        // In the dark the line has all 255 gray values to itself: what remains is their rounding.
+        scene.ambient.level = 0.0;
         let errors = measure(scene, (1280, 720), 0.2, 3);
         assert_eq!(errors.found, errors.measurable, "{name}: every row is found");
-        let (stripe_px, depth_mm) = (quantile(&errors.stripe_px, 0.95), quantile(&errors.depth_mm, 0.5));
-        println!("{name}: stripe p95 {stripe_px:.4} px, depth median {depth_mm:.4} mm");
-        assert!(stripe_px < 0.02, "{name}: stripe p95 {stripe_px} px");
-        assert!(depth_mm < 0.02, "{name}: depth median {depth_mm} mm");
+        let (median_px, p95_px) = (quantile(&errors.stripe_px, 0.5), quantile(&errors.stripe_px, 0.95));
+        let bias_mm = errors.depth_mm.iter().sum::<f64>() / errors.depth_mm.len() as f64;
+        println!("{name}, exact: stripe median {median_px:.4} px, p95 {p95_px:.4} px, depth bias {bias_mm:.4} mm");
+        assert!(p95_px < 0.02, "{name}: stripe p95 {p95_px} px");
+        assert!(bias_mm.abs() < 0.02, "{name}: depth bias {bias_mm} mm");
+    }
+}
+
+#[test]
+fn the_true_stripe_gives_the_true_depth_to_0_02_mm() {
+    for name in ["wall", "pipe", "step-gauge", "lens"] {
+        let scene = Scene::named(name).expect("a scene").exact();
+        let simulation = Simulation::new(scene, (1280, 720), 30.0, 0.2, 3).expect("a simulation");
+        let mut errors_mm = Vec::new();
+        for index in 0..simulation.frames_total() {
+            let (_, truth) = simulation.render(index);
+            let stripe = Stripe {
+                line: simulation.rig().laser.line,
+                confidence: vec![1.0; truth.stripe_across_px.len()],
+                across_px: truth.stripe_across_px,
+            };
+            for point in &triangulate(&stripe, simulation.rig()).points {
+                let world = simulation.pose(index) * point.point_in_camera;
+                errors_mm.extend(simulation.surface_z_mm(world.x, world.y).map(|z_mm| world.z - z_mm));
+            }
+        }
+        let p99_mm = quantile(&errors_mm, 0.99);
+        println!("{name}: depth of the true stripe, p99 {p99_mm:.5} mm of {} points", errors_mm.len());
+        // The columns are float32 and a step's edge is steep: one in a hundred may lie on it.
+        assert!(p99_mm < 0.02, "{name}: {p99_mm} mm");
     }
 }
 

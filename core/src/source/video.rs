@@ -302,12 +302,11 @@ fn check_size(name: &str, width_px: u32, height_px: u32) -> Result<()> {
     if fits(width_px) && fits(height_px) {
         return Ok(());
     }
-    Err(Error::field(
-        name,
-        "image size",
-        format!("{width_px}x{height_px} px"),
-        format!("16 to {MAX_IMAGE_SIDE_PX} px a side"),
-    ))
+    let found = match (width_px, height_px) {
+        (0, 0) => "unknown: 0x0 px, or more than the decoder takes".to_string(),
+        _ => format!("{width_px}x{height_px} px"),
+    };
+    Err(Error::field(name, "image size", found, format!("16 to {MAX_IMAGE_SIDE_PX} px a side")))
 }
 
 fn planar_shifts(format: Pixel) -> Option<(u32, u32)> {
