@@ -5,6 +5,7 @@ mod process;
 mod progress;
 mod send;
 mod serve;
+mod simulate;
 
 use std::process::ExitCode;
 
@@ -22,6 +23,7 @@ struct Cli {
 #[derive(Subcommand)]
 enum Command {
     Process(process::Process),
+    Simulate(simulate::SimulateArgs),
     Serve(serve::Serve),
     Send(send::Send),
     Inspect(inspect::Inspect),
@@ -68,6 +70,7 @@ pub fn run() -> ExitCode {
     let cli = Cli::parse();
     let outcome = match cli.command {
         Command::Process(command) => command.run(),
+        Command::Simulate(args) => simulate::run(&args).map(|()| Success::Done).map_err(Failed::from),
         Command::Serve(command) => command.run(),
         Command::Send(command) => command.run(),
         Command::Inspect(command) => command.run(),

@@ -74,7 +74,9 @@ impl Db {
                 .foreign_keys(true)
         });
         let connection = Database::connect(options).await.map_err(|e| match e {
-            DbErr::Conn(inner) => Error::Internal(format!("{}: cannot be opened as a database: {inner}", path.display())),
+            DbErr::Conn(inner) => {
+                Error::Internal(format!("{}: cannot be opened as a database: {inner}", path.display()))
+            }
             other => Error::Records(other),
         })?;
         let db = Db { connection, writer: Arc::default() };

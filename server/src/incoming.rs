@@ -66,11 +66,8 @@ impl Receiver {
 }
 
 fn write_all(folder: &Path, mut chunks: mpsc::Receiver<Bytes>) -> Result<Incoming> {
-    let mut file = tempfile::Builder::new()
-        .prefix(PREFIX)
-        .suffix(SUFFIX)
-        .tempfile_in(folder)
-        .map_err(|e| Error::io(folder, e))?;
+    let mut file =
+        tempfile::Builder::new().prefix(PREFIX).suffix(SUFFIX).tempfile_in(folder).map_err(|e| Error::io(folder, e))?;
     let (mut hash, mut bytes) = (Sha256::new(), 0);
     while let Some(chunk) = chunks.blocking_recv() {
         file.write_all(&chunk).map_err(|e| Error::io(file.path(), e))?;
@@ -85,7 +82,8 @@ fn write_all(folder: &Path, mut chunks: mpsc::Receiver<Bytes>) -> Result<Incomin
 pub fn remove_leftovers(folder: &Path) -> Result<()> {
     for entry in std::fs::read_dir(folder).map_err(|e| Error::io(folder, e))? {
         let path = entry.map_err(|e| Error::io(folder, e))?.path();
-        let ours = path.file_name().and_then(|n| n.to_str()).is_some_and(|n| n.starts_with(PREFIX) && n.ends_with(SUFFIX));
+        let ours =
+            path.file_name().and_then(|n| n.to_str()).is_some_and(|n| n.starts_with(PREFIX) && n.ends_with(SUFFIX));
         if ours {
             std::fs::remove_file(&path).map_err(|e| Error::io(&path, e))?;
         }

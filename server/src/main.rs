@@ -3,18 +3,18 @@
 //! Who may know whom: `http/*` and `worker` never import each other; they meet in the records (`runs`, `db`), the
 //! `queue` and the `store`. Only the `process` command runs the pipeline; workers start it as a child process.
 
-mod cli;
-mod config;
-mod db;
-mod error;
-mod http;
-mod incoming;
-mod queue;
-mod retention;
-mod runs;
-mod store;
-mod wire;
-mod worker;
+pub mod cli;
+pub mod config;
+pub mod db;
+pub mod error;
+pub mod http;
+pub mod incoming;
+pub mod queue;
+pub mod retention;
+pub mod runs;
+pub mod store;
+pub mod wire;
+pub mod worker;
 
 use std::process::ExitCode;
 

@@ -326,12 +326,13 @@ async fn remember(records: &impl ConnectionTrait, key: Option<&str>, fingerprint
 async fn insert_asset(records: &impl ConnectionTrait, name: &str) -> Result<()> {
     let row = asset::ActiveModel { name: Set(name.into()), created_ms: Set(now_ms()) };
     let keep = OnConflict::column(asset::Column::Name).do_nothing().to_owned();
-    asset::Entity::insert(row).on_conflict(keep).do_nothing().exec_without_returning(records).await?;
+    asset::Entity::insert(row).on_conflict(keep).try_insert().exec_without_returning(records).await?;
     Ok(())
 }
 
 fn check_name(field: &str, name: &str) -> Result<()> {
-    let plain = !name.trim().is_empty() && name.chars().count() <= MAX_NAME_CHARS && !name.chars().any(char::is_control);
+    let plain =
+        !name.trim().is_empty() && name.chars().count() <= MAX_NAME_CHARS && !name.chars().any(char::is_control);
     if plain {
         return Ok(());
     }
@@ -343,7 +344,11 @@ fn check_chainage(chainage_mm: f64) -> Result<()> {
     if chainage_mm.abs() <= MAX_CHAINAGE_MM {
         return Ok(());
     }
-    Err(Error::field("chainage_mm", format!("chainage_mm is {chainage_mm} mm"), format!("within ±{MAX_CHAINAGE_MM:e} mm")))
+    Err(Error::field(
+        "chainage_mm",
+        format!("chainage_mm is {chainage_mm} mm"),
+        format!("within ±{MAX_CHAINAGE_MM:e} mm"),
+    ))
 }
 
 fn check_note(note: &str) -> Result<()> {

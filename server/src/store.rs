@@ -154,7 +154,8 @@ impl Store {
     /// pyramid of tiles has thousands of files.
     pub async fn sync(&self) -> Result<()> {
         let root = self.root.clone();
-        let synced = blocking(move || rustix::fs::syncfs(std::fs::File::open(root.as_path())?).map_err(Into::into)).await?;
+        let synced =
+            blocking(move || rustix::fs::syncfs(std::fs::File::open(root.as_path())?).map_err(Into::into)).await?;
         synced.map_err(|e| Error::io(self.root.as_path(), e))
     }
 
@@ -252,7 +253,8 @@ mod tests {
         for name in ["depth.tif", "tiles/depth/3/0_1.png", "cloud-2.ply", "report_v1.html"] {
             assert!(ProductName::new(name).is_some(), "{name}");
         }
-        for name in ["", "..", "../x", "a//b", "/etc/passwd", "a/../b", ".hidden", "a\\b", "a b", "é", "a%2fb", "a\0b"] {
+        for name in ["", "..", "../x", "a//b", "/etc/passwd", "a/../b", ".hidden", "a\\b", "a b", "é", "a%2fb", "a\0b"]
+        {
             assert!(ProductName::new(name).is_none(), "{name:?}");
         }
         assert!(ProductName::new(&"a".repeat(MAX_NAME_CHARS + 1)).is_none());
@@ -282,7 +284,8 @@ mod tests {
         assert!(!file.exists());
         for key in [&moved, &copied] {
             for (range, expected) in [(0..10, "0123456789"), (3..5, "34"), (9..10, "9"), (4..4, "")] {
-                let chunks: Vec<Bytes> = store.read(key, range).await.expect("opens").try_collect().await.expect("reads");
+                let chunks: Vec<Bytes> =
+                    store.read(key, range).await.expect("opens").try_collect().await.expect("reads");
                 assert_eq!(chunks.concat(), expected.as_bytes());
             }
         }

@@ -66,7 +66,10 @@ fn rig(path: &Path) -> Result<(&'static str, Facts, Value), Failed> {
     let facts = vec![
         ("name", rig.name.clone()),
         ("image", format!("{} x {} px", camera.width_px, camera.height_px)),
-        ("focal length", format!("{:.1} x {:.1} px ({:.1}° wide)", camera.fx_px, camera.fy_px, camera.fov_rad().to_degrees())),
+        (
+            "focal length",
+            format!("{:.1} x {:.1} px ({:.1}° wide)", camera.fx_px, camera.fy_px, camera.fov_rad().to_degrees()),
+        ),
         ("centre", format!("{:.1}, {:.1} px", camera.cx_px, camera.cy_px)),
         ("distortion", format!("{:?}", camera.distortion)),
         ("laser", format!("{colour}, {line}")),
@@ -89,7 +92,16 @@ fn products(path: &Path) -> Result<(&'static str, Facts, Value), Failed> {
         ("points", q.points.to_string()),
     ];
     if let Some(map) = &manifest.depth_map {
-        facts.push(("map", format!("{} x {} px of {:.3} mm, {:.1} % measured", map.width_px, map.height_px, map.mm_per_px, 100.0 * q.coverage)));
+        facts.push((
+            "map",
+            format!(
+                "{} x {} px of {:.3} mm, {:.1} % measured",
+                map.width_px,
+                map.height_px,
+                map.mm_per_px,
+                100.0 * q.coverage
+            ),
+        ));
     }
     facts.push(("products", format!("{} files, {}", manifest.products.len(), size(bytes))));
     facts.extend(manifest.warnings.iter().map(|w| ("warning", w.clone())));
@@ -99,8 +111,29 @@ fn products(path: &Path) -> Result<(&'static str, Facts, Value), Failed> {
 
 /// A video or a folder of images.
 fn source(path: &Path) -> Result<(&'static str, Facts, Value), Failed> {
-    Err(Failed::Input(format!(
-        "{}: not a rig (.toml, .json) and not a product folder",
-        path.display()
-    )))
+    let name = path.display().to_string();
+    let source = stria_core::source::open(path, &name, None)?;
+    let info = source.info();
+    let or_unknown = |text: Option<String>| text.unwrap_or_else(|| "not announced".into());
+    let bytes: u64 = info.files.iter().filter_map(|f| std::fs::metadata(f).ok()).map(|f| f.len()).sum();
+    let length_s = info.frames_announced.zip(info.frames_per_s).map(|(frames, rate)| frames as f64 / rate);
+    let facts = vec![
+        ("image", format!("{} x {} px", info.width_px, info.height_px)),
+        ("frames", or_unknown(info.frames_announced.map(|n| n.to_string()))),
+        ("frames/s", or_unknown(info.frames_per_s.map(|rate| format!("{rate:.3}")))),
+        ("length", or_unknown(length_s.map(|s| format!("{s:.2} s")))),
+        (
+            "size",
+            format!("{} in {} {}", size(bytes), info.files.len(), if info.files.len() == 1 { "file" } else { "files" }),
+        ),
+    ];
+    let value = json!({
+        "width_px": info.width_px,
+        "height_px": info.height_px,
+        "frames_announced": info.frames_announced,
+        "frames_per_s": info.frames_per_s,
+        "files": info.files.len(),
+        "bytes": bytes,
+    });
+    Ok((if path.is_dir() { "a folder of images" } else { "a video" }, facts, value))
 }

@@ -23,7 +23,9 @@ const CANCELLED: i32 = 130;
 /// Process a run: a video or a folder of images, with its rig, into a folder of products
 #[derive(Args)]
 #[command(after_long_help = options_help())]
-#[command(after_help = "Example: stria process run.mp4 --rig rig.toml --out products\n`stria process --help` lists the options for --set.")]
+#[command(
+    after_help = "Example: stria process run.mp4 --rig rig.toml --out products\n`stria process --help` lists the options for --set."
+)]
 pub(super) struct Process {
     /// A video file (whatever FFmpeg reads), or a folder of images, sorted by name
     source: PathBuf,
@@ -48,7 +50,7 @@ pub(super) struct Process {
     /// Frames a second of a folder of images
     #[arg(long, value_name = "F")]
     fps: Option<f64>,
-    /// When the run was recorded (RFC 3339), where the source does not say so
+    /// When the run was recorded (RFC 3339); when nothing is said, the time of the file
     #[arg(long, value_name = "TIME")]
     recorded_at: Option<jiff::Timestamp>,
     /// The name of the source in messages and the manifest
@@ -112,7 +114,11 @@ impl Process {
         let mut recipe = Recipe::load(&self.recipe)?;
         for change in &self.set {
             let Some((key, value)) = change.split_once('=') else {
-                return Err(stria_core::Error::input(format!("--set {change}"), "no '='", "key=value, such as stripe.k=0.8"));
+                return Err(stria_core::Error::input(
+                    format!("--set {change}"),
+                    "no '='",
+                    "key=value, such as stripe.k=0.8",
+                ));
             };
             recipe.set(key.trim(), value.trim())?;
         }
@@ -123,6 +129,7 @@ impl Process {
             source: self.source.clone(),
             source_name: self.name.clone().or(name).unwrap_or_else(|| self.source.display().to_string()),
             fps: self.fps,
+            recorded_at: self.recorded_at.unwrap_or_else(|| time_of(&self.source)),
             rig,
             recipe,
             out_dir: self.out.clone(),
@@ -147,6 +154,12 @@ impl Process {
             Event::Segment { .. } => {}
         }
     }
+}
+
+/// When a file was last written; now, where nobody knows.
+fn time_of(path: &Path) -> jiff::Timestamp {
+    let written = std::fs::metadata(path).and_then(|facts| facts.modified()).ok();
+    written.and_then(|time| jiff::Timestamp::try_from(time).ok()).unwrap_or_else(jiff::Timestamp::now)
 }
 
 fn say_json(line: &impl serde::Serialize) -> Result<(), Failed> {
@@ -222,13 +235,32 @@ fn remove_halves(out: &Path, folder_was_there: bool) {
 fn summary(manifest: &Manifest, out: &Path, seconds: f64) {
     let q = &manifest.quality;
     let bytes: u64 = manifest.products.iter().map(|p| p.bytes).sum();
-    println!("Done in {}: {} frames, {:.1} frames/s", duration(seconds), q.frames, q.frames as f64 / seconds.max(0.001));
+    println!(
+        "Done in {}: {} frames, {:.1} frames/s",
+        duration(seconds),
+        q.frames,
+        q.frames as f64 / seconds.max(0.001)
+    );
     println!("  products  {} files, {} in {}", manifest.products.len(), size(bytes), out.display());
-    println!("  stripe    {} of {} frames, {:.1} % of their rows", q.frames_with_stripe, q.frames, 100.0 * q.rows_found);
-    println!("  motion    {} of {} frames, {:.1} mm in {:.1} s", q.frames_tracked, q.frames.saturating_sub(1), q.travel_mm, q.duration_s);
+    println!(
+        "  stripe    {} of {} frames, {:.1} % of their rows",
+        q.frames_with_stripe,
+        q.frames,
+        100.0 * q.rows_found
+    );
+    println!(
+        "  motion    {} of {} frames, {:.1} mm in {:.1} s",
+        q.frames_tracked,
+        q.frames.saturating_sub(1),
+        q.travel_mm,
+        q.duration_s
+    );
     println!("  surface   {} points, {:.1} % of the map", q.points, 100.0 * q.coverage);
     if let Some(r) = &manifest.resolution {
-        println!("  one px    {:.2} mm deep at {:.0} mm, {:.2} mm along the line", r.r_depth_mm, r.distance_mm, r.r_vertical_mm);
+        println!(
+            "  one px    {:.2} mm deep at {:.0} mm, {:.2} mm along the line",
+            r.r_depth_mm, r.distance_mm, r.r_vertical_mm
+        );
     }
     for warning in &manifest.warnings {
         println!("  warning   {warning}");

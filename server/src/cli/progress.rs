@@ -58,8 +58,9 @@ impl JobBar {
 
 /// A bar of bytes on stderr.
 pub(super) fn byte_bar(bytes: u64) -> ProgressBar {
-    ProgressBar::new(bytes)
-        .with_style(style("       sending [{bar:30}] {percent:>3} %  {bytes} of {total_bytes}, {bytes_per_sec}, {eta} left"))
+    ProgressBar::new(bytes).with_style(style(
+        "       sending [{bar:30}] {percent:>3} %  {bytes} of {total_bytes}, {bytes_per_sec}, {eta} left",
+    ))
 }
 
 fn style(template: &str) -> ProgressStyle {
@@ -101,7 +102,9 @@ mod tests {
 
     #[test]
     fn templates_are_sound() {
-        for template in ["{prefix:>14} [{bar:30}] {percent:>3} %  {msg}", "{bytes} of {total_bytes}, {bytes_per_sec}, {eta} left"] {
+        for template in
+            ["{prefix:>14} [{bar:30}] {percent:>3} %  {msg}", "{bytes} of {total_bytes}, {bytes_per_sec}, {eta} left"]
+        {
             assert!(ProgressStyle::with_template(template).is_ok(), "{template}");
         }
     }

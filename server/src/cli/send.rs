@@ -26,7 +26,9 @@ const ANSWER: Duration = Duration::from_secs(60);
 
 /// Send a run to a server
 #[derive(Args)]
-#[command(after_help = "Example: stria send run.mp4 --server http://127.0.0.1:8420 --asset 'Pipe 7' --rig rig.toml --wait")]
+#[command(
+    after_help = "Example: stria send run.mp4 --server http://127.0.0.1:8420 --asset 'Pipe 7' --rig rig.toml --wait"
+)]
 pub(super) struct Send {
     /// The video file
     source: PathBuf,
@@ -130,7 +132,10 @@ impl Send {
         let facts = file.metadata().map_err(unreadable)?;
         if facts.is_dir() {
             let hint = "a folder of images can be processed here with `stria process`";
-            return Err(Failed::Input(format!("{}: is a folder; expected a video file ({hint})", self.source.display())));
+            return Err(Failed::Input(format!(
+                "{}: is a folder; expected a video file ({hint})",
+                self.source.display()
+            )));
         }
         let name = self.source.file_name().map(|n| n.to_string_lossy().into_owned()).unwrap_or_default();
         let mut fields = vec![

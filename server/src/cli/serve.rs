@@ -122,9 +122,9 @@ async fn serve(config: Config) -> std::result::Result<(), Failed> {
     let stop = CancellationToken::new();
     let mut signals = StopSignals::listen().map_err(|e| Failed::Other(format!("signals cannot be heard: {e}")))?;
     let _lock = prepare(&config).map_err(failed)?;
-    let listener = http::connection::listen(config.listen)
-        .await
-        .map_err(|e| Failed::Input(format!("--listen {}: {e}; expected a free address of this machine", config.listen)))?;
+    let listener = http::connection::listen(config.listen).await.map_err(|e| {
+        Failed::Input(format!("--listen {}: {e}; expected a free address of this machine", config.listen))
+    })?;
     let address = listener.local_addr().map_err(|e| Failed::Other(e.to_string()))?;
     let db = Db::open_sqlite(&config.database()).await.map_err(failed)?;
     let queue = Queue::new(db.clone(), config.jobs.clone());
@@ -196,7 +196,9 @@ fn prepare(config: &Config) -> Result<File> {
         Ok(()) => {}
         Err(TryLockError::WouldBlock) => {
             let folder = config.data_dir.display();
-            return Err(Error::Internal(format!("{folder} is in use by another stria serve; give each its own --data")));
+            return Err(Error::Internal(format!(
+                "{folder} is in use by another stria serve; give each its own --data"
+            )));
         }
         Err(TryLockError::Error(e)) => return Err(Error::io(&path, e)),
     }

@@ -4,8 +4,8 @@ use std::ops::Range;
 
 use axum::body::Body;
 use axum::http::header::{
-    ACCEPT_RANGES, CACHE_CONTROL, CONTENT_DISPOSITION, CONTENT_LENGTH, CONTENT_RANGE, CONTENT_TYPE, ETAG, IF_NONE_MATCH,
-    IF_RANGE, RANGE,
+    ACCEPT_RANGES, CACHE_CONTROL, CONTENT_DISPOSITION, CONTENT_LENGTH, CONTENT_RANGE, CONTENT_TYPE, ETAG,
+    IF_NONE_MATCH, IF_RANGE, RANGE,
 };
 use axum::http::{HeaderMap, Method, StatusCode};
 use axum::response::{IntoResponse, Response};
@@ -36,11 +36,7 @@ pub(super) struct FileAnswer {
 /// Answers a request for a file.
 pub(super) async fn send(store: &Store, method: &Method, asked: &HeaderMap, file: FileAnswer) -> Result<Response> {
     let etag = format!("\"{}\"", file.facts.sha256);
-    let mut headers = vec![
-        (ETAG, etag.clone()),
-        (CACHE_CONTROL, file.cache.into()),
-        (ACCEPT_RANGES, "bytes".into()),
-    ];
+    let mut headers = vec![(ETAG, etag.clone()), (CACHE_CONTROL, file.cache.into()), (ACCEPT_RANGES, "bytes".into())];
     if none_matches(asked, &etag) {
         return Ok((StatusCode::NOT_MODIFIED, headers_of(headers)).into_response());
     }
@@ -150,7 +146,8 @@ mod tests {
 
     #[test]
     fn if_range_protects_against_a_changed_file() {
-        for (condition, expected) in [("\"e\"", Asked::Part(0..1)), ("\"f\"", Asked::Whole), ("W/\"e\"", Asked::Whole)] {
+        for (condition, expected) in [("\"e\"", Asked::Part(0..1)), ("\"f\"", Asked::Whole), ("W/\"e\"", Asked::Whole)]
+        {
             let pairs = [(RANGE, "bytes=0-0"), (IF_RANGE, condition)];
             let headers = pairs.into_iter().map(|(n, v)| (n, v.parse().expect("value"))).collect();
             assert_eq!(asked_range(&headers, "\"e\"", 100), expected, "{condition}");

@@ -210,9 +210,8 @@ fn number(name: &str, value: &str) -> Result<f64> {
 }
 
 fn direction(value: &str) -> Result<Direction> {
-    Direction::parse(value.trim()).ok_or_else(|| {
-        Error::field("direction", format!("direction is '{}'", printable(value)), "forward or backward")
-    })
+    Direction::parse(value.trim())
+        .ok_or_else(|| Error::field("direction", format!("direction is '{}'", printable(value)), "forward or backward"))
 }
 
 fn sha256(value: &str) -> Result<String> {

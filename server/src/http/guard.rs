@@ -103,7 +103,9 @@ mod tests {
         for host in ["localhost", "localhost:8420", "LOCALHOST:1", "127.0.0.1:8420", "127.8.0.1", "[::1]:8420"] {
             assert!(check_host(&headers(&[("host", host)]), None, true).is_ok(), "{host}");
         }
-        for host in ["evil.example", "localhost.evil.example", "127.0.0.1.evil.example:80", "192.168.1.2", "[::2]:1", ""] {
+        for host in
+            ["evil.example", "localhost.evil.example", "127.0.0.1.evil.example:80", "192.168.1.2", "[::2]:1", ""]
+        {
             assert!(check_host(&headers(&[("host", host)]), None, true).is_err(), "{host}");
         }
         assert!(check_host(&headers(&[("host", "robots.example")]), None, false).is_ok());
@@ -116,7 +118,13 @@ mod tests {
         for more in [vec![], vec![("origin", "http://localhost:8420")], vec![("sec-fetch-site", "same-origin")]] {
             assert!(check_origin(&headers(&[vec![host], more].concat())).is_ok());
         }
-        for more in [("origin", "https://evil.example"), ("origin", "null"), ("origin", "http://localhost:9"), ("sec-fetch-site", "cross-site"), ("sec-fetch-site", "same-site")] {
+        for more in [
+            ("origin", "https://evil.example"),
+            ("origin", "null"),
+            ("origin", "http://localhost:9"),
+            ("sec-fetch-site", "cross-site"),
+            ("sec-fetch-site", "same-site"),
+        ] {
             assert!(check_origin(&headers(&[host, more])).is_err(), "{more:?}");
         }
     }

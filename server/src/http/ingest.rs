@@ -108,7 +108,8 @@ async fn receive_form(app: &App, parts: &axum::http::request::Parts, body: Body)
         body.expect_head();
         let next = tokio::time::timeout(limits.sender_silence, form.next_field()).await;
         let Some(mut part) = next.map_err(|_| Error::SenderSilent)?.map_err(broken_form)? else {
-            let incoming = incoming.ok_or_else(|| Error::field("file", "the form has no file", "one part named 'file'"))?;
+            let incoming =
+                incoming.ok_or_else(|| Error::field("file", "the form has no file", "one part named 'file'"))?;
             fields.check_complete()?;
             return Ok((fields, incoming));
         };

@@ -37,9 +37,7 @@ const PAGE_POLICY: &str = "default-src 'self'; script-src 'self' 'wasm-unsafe-ev
 
 /// The page answers every address that is not the API's, because it has addresses of its own for runs and jobs.
 pub(super) fn routes() -> Router<App> {
-    Router::new()
-        .route("/viewer/{*path}", get(get_viewer))
-        .fallback(get_page)
+    Router::new().route("/viewer/{*path}", get(get_viewer)).fallback(get_page)
 }
 
 async fn get_page(uri: Uri, headers: HeaderMap) -> Result<Response> {

@@ -34,7 +34,8 @@ impl IntoResponse for Error {
                 answer(StatusCode::NOT_FOUND, "not-found", "Nothing of that name exists", detail, false)
             }
             Error::Input { field, expected, .. } => {
-                let mut problem = problem(StatusCode::BAD_REQUEST, "bad-input", "The request cannot be used", detail, false);
+                let mut problem =
+                    problem(StatusCode::BAD_REQUEST, "bad-input", "The request cannot be used", detail, false);
                 (problem.field, problem.expected) = (field, expected);
                 send(StatusCode::BAD_REQUEST, &problem)
             }
@@ -85,8 +86,13 @@ impl IntoResponse for Refusal {
             }
             Refusal::Range { asked, bytes } => {
                 let detail = format!("the range {asked:?} lies outside the file's {bytes} bytes");
-                let mut response =
-                    answer(StatusCode::RANGE_NOT_SATISFIABLE, "no-such-range", "There are no such bytes", detail, false);
+                let mut response = answer(
+                    StatusCode::RANGE_NOT_SATISFIABLE,
+                    "no-such-range",
+                    "There are no such bytes",
+                    detail,
+                    false,
+                );
                 if let Ok(value) = HeaderValue::from_str(&format!("bytes */{bytes}")) {
                     response.headers_mut().insert(axum::http::header::CONTENT_RANGE, value);
                 }

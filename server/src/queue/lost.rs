@@ -20,9 +20,8 @@ const LOST_FILES_MS: i64 = 600_000;
 impl Queue {
     /// Takes back every lease of a node that has just started: whoever held them is dead.
     pub async fn recover(&self, node: &str) -> Result<usize> {
-        let held = Condition::all()
-            .add(job::Column::State.eq(JobState::Running.as_str()))
-            .add(job::Column::Node.eq(node));
+        let held =
+            Condition::all().add(job::Column::State.eq(JobState::Running.as_str())).add(job::Column::Node.eq(node));
         let mut lost = 0;
         for row in job::Entity::find().filter(held).all(self.db.read()).await? {
             lost += usize::from(self.lose(&row.id, row.fence, row.beat, now_ms()).await?);
@@ -46,8 +45,12 @@ impl Queue {
             _ => JobState::Cancelled,
         };
         let again = state == JobState::Queued;
-        let words = format!("the worker '{}' was lost in attempt {} (its process was killed, or its machine stopped)", row.worker, row.attempt);
-        let failure = Failure::new("lost", format!("{words}; {losses} of at most {} losses", self.limits.max_losses), again);
+        let words = format!(
+            "the worker '{}' was lost in attempt {} (its process was killed, or its machine stopped)",
+            row.worker, row.attempt
+        );
+        let failure =
+            Failure::new("lost", format!("{words}; {losses} of at most {} losses", self.limits.max_losses), again);
         let change = job::ActiveModel {
             losses: Set(losses),
             error: Set(Some(problem_of(&failure, again)?)),

@@ -83,9 +83,11 @@ fn fast() -> JobLimits {
 #[tokio::test]
 async fn urgent_jobs_go_first_and_waiting_makes_up_for_it() {
     let r = records(fast()).await;
-    let (batch, upload, live) = (r.add(Priority::Batch).await, r.add(Priority::Upload).await, r.add(Priority::Live).await);
+    let (batch, upload, live) =
+        (r.add(Priority::Batch).await, r.add(Priority::Upload).await, r.add(Priority::Live).await);
     let old = r.add(Priority::Batch).await;
-    let change = job::ActiveModel { rank_ms: Set(rank_ms(now_ms() - 2 * 3_600_000, Priority::Batch)), ..Default::default() };
+    let change =
+        job::ActiveModel { rank_ms: Set(rank_ms(now_ms() - 2 * 3_600_000, Priority::Batch)), ..Default::default() };
     job::Entity::update_many().set(change).filter(job::Column::Id.eq(&old)).exec(r.db.read()).await.expect("ages");
     for expected in [live, old, upload, batch] {
         assert_eq!(r.claim().await.expect("a job").job, expected);

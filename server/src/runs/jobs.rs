@@ -7,8 +7,8 @@ use super::{Page, Runs, to_u64};
 use crate::db::tables::{job, log_line, product, segment};
 use crate::error::{Error, Result};
 use crate::store::{Facts, Key, ProductName};
-use crate::wire::{self, RecordingSegment};
 use crate::wire::time::to_text;
+use crate::wire::{self, RecordingSegment};
 
 /// A product or a recording segment, to be sent.
 pub struct StoredFile {

@@ -163,10 +163,8 @@ impl Runs {
     /// Worker processes and what they are at.
     pub async fn workers(&self) -> Result<Vec<wire::Worker>> {
         let rows = worker::Entity::find().order_by_asc(worker::Column::Name).all(self.db.read()).await?;
-        let running = job::Entity::find()
-            .filter(job::Column::State.eq(JobState::Running.as_str()))
-            .all(self.db.read())
-            .await?;
+        let running =
+            job::Entity::find().filter(job::Column::State.eq(JobState::Running.as_str())).all(self.db.read()).await?;
         let of = |w: worker::Model| wire::Worker {
             jobs: running.iter().filter(|j| j.worker == w.name).map(|j| j.id.clone()).collect(),
             name: w.name,

@@ -155,7 +155,7 @@ pub(super) async fn keep_if_new(records: &impl ConnectionTrait, new: &RigText) -
         sha256: Set(sha256_of(&new.toml)),
     };
     let keep = OnConflict::column(rig::Column::Name).do_nothing().to_owned();
-    rig::Entity::insert(row).on_conflict(keep).do_nothing().exec_without_returning(records).await?;
+    rig::Entity::insert(row).on_conflict(keep).try_insert().exec_without_returning(records).await?;
     Ok(())
 }
 

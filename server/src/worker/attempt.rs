@@ -114,7 +114,8 @@ async fn work(worker: &Worker, lease: &Lease, mut signals: watch::Receiver<Signa
         Ok(manifest) => manifest,
         Err(failure) => return Ok(Ended::Failed(failure)),
     };
-    let storing = Progress { stage: STORING.into(), fraction: 1.0, frames: manifest.quality.frames, ..Progress::default() };
+    let storing =
+        Progress { stage: STORING.into(), fraction: 1.0, frames: manifest.quality.frames, ..Progress::default() };
     worker.queue.progress(lease, &storing).await?;
     tokio::select! {
         outcome = publish::store(worker, lease, &scratch, *manifest) => Ok(Ended::Done(outcome?)),
@@ -154,7 +155,8 @@ impl Teller<'_> {
         let (queue, limits) = (&self.worker.queue, &self.worker.limits);
         match said {
             Said::Event(Event::Progress { stage, fraction, frames, frames_total, frames_per_s, time_left_s }) => {
-                let fresh = self.told.as_ref().is_some_and(|(at, told)| *told == stage && at.elapsed() < limits.progress_every);
+                let fresh =
+                    self.told.as_ref().is_some_and(|(at, told)| *told == stage && at.elapsed() < limits.progress_every);
                 if fresh {
                     return Ok(());
                 }
