@@ -6,7 +6,7 @@ export interface components { schemas: {
   Job: { id: string; run: string; state: components["schemas"]["JobState"]; cancelling: boolean; stage: string; progress: number; frames: number; frames_total?: number | null; frames_per_s: number; time_left_s?: number | null; attempt: number; priority: components["schemas"]["Priority"]; rig: string; recipe: string; warnings: string[]; error?: components["schemas"]["Problem"] | null; quality?: unknown; created_at: string; started_at?: string | null; finished_at?: string | null; next_attempt_at?: string | null };
   LogLine: { number: number; at: string; attempt: number; text: string };
   Product: { name: string; bytes: number; sha256: string; content_type: string; url: string };
-  RecordingSegment: { number: number; attempt: number; bytes: number; url: string };
+  RecordingSegment: { number: number; generation: number; bytes: number; url: string };
   Recording: { segments: components["schemas"]["RecordingSegment"][]; complete: boolean; recording?: string | null };
   Rig: { name: string; created_at: string; sha256: string; rig: unknown; toml: string };
   Recipe: { name: string; default: boolean; toml: string };

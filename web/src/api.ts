@@ -168,6 +168,8 @@ export function sendRun(upload: Upload, progress: (sent: number, all: number) =>
   form.append("recipe", upload.recipe);
   if (typeof upload.rig === "string") form.append("rig", upload.rig);
   else form.append("rig", upload.rig, upload.rig.name);
+  // Browsers write a quote in a part's own file name as %22; a field of its own keeps the name as it is.
+  form.append("filename", upload.video.name);
   form.append("file", upload.video, upload.video.name);
   return new Promise((done, failed) => {
     const request = new XMLHttpRequest();
@@ -183,6 +185,11 @@ export function sendRun(upload: Upload, progress: (sent: number, all: number) =>
     signal.addEventListener("abort", () => request.abort());
     request.send(form);
   });
+}
+
+/** True while something may still happen to a job by itself. */
+export function isActive({ state }: { state: JobState }): boolean {
+  return state === "queued" || state === "running";
 }
 
 /** What a job says while it goes on. */
@@ -211,8 +218,13 @@ export function followJob(job: string, listener: JobListener): () => void {
     };
     const on = (name: string, heard: (data: string) => void) =>
       source.addEventListener(name, (event) => heard((event as MessageEvent<string>).data));
-    on("state", (data) => listener.job(JSON.parse(data) as Job));
-    on("progress", (data) => listener.job(JSON.parse(data) as Job));
+    const heardJob = (data: string) => {
+      const now = JSON.parse(data) as Job;
+      if (!isActive(now)) source.close(); // the server ends the stream here; no need to come back
+      listener.job(now);
+    };
+    on("state", heardJob);
+    on("progress", heardJob);
     on("segment", () => listener.segment());
   };
   connect();

@@ -1,7 +1,7 @@
 // What several views need: the page's title, data that is loaded and kept fresh, a job followed live.
 
 import { useEffect, useRef, useState } from "preact/hooks";
-import { followJob, problemOf, type Job, type Problem } from "./api.ts";
+import { followJob, isActive, problemOf, type Job, type Problem } from "./api.ts";
 import { texts } from "./texts.ts";
 
 /** Names the browser's tab. */
@@ -88,7 +88,7 @@ export function useFollowed(job: string | null, active: boolean, onEnd: () => vo
     return followJob(job, {
       job: (now) => {
         setHeard((before) => ({ ...before, job: now }));
-        if (now.state !== "queued" && now.state !== "running") onEnd();
+        if (!isActive(now)) onEnd();
       },
       segment: () => setHeard((before) => ({ ...before, segments: before.segments + 1 })),
       connected: (connected) => setHeard((before) => ({ ...before, connected })),

@@ -42,8 +42,8 @@ const SIMD_PROBE = new Uint8Array([
 
 const CHANNEL = "stria";
 
-/** Where the server keeps the viewer's two files. The version is that of the SDK in Cargo.toml. */
-const FOLDER = "/viewer/0.36.3";
+/** Where the server keeps the viewer's two files, at the version of its own SDK. */
+const FOLDER = "/viewer";
 
 let loaded: Promise<void> | undefined;
 

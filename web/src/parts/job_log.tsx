@@ -1,7 +1,7 @@
 // A job's log, loaded when somebody opens it.
 
 import { useState } from "preact/hooks";
-import { listLog, type Job } from "../api.ts";
+import { isActive, listLog, type Job } from "../api.ts";
 import { utcTime } from "../format.ts";
 import { useLoaded } from "../hooks.ts";
 import { texts } from "../texts.ts";
@@ -20,8 +20,7 @@ export function JobLog({ job }: { job: Job }) {
 }
 
 function Lines({ job }: { job: Job }) {
-  const active = job.state === "queued" || job.state === "running";
-  const log = useLoaded(`log ${job.id} ${job.state}`, () => listLog(job.id), () => (active ? FRESH_MS : null));
+  const log = useLoaded(`log ${job.id} ${job.state}`, () => listLog(job.id), () => (isActive(job) ? FRESH_MS : null));
   if (log.problem) return <ProblemBox problem={log.problem} onRetry={log.reload} />;
   if (log.value === null) return <p role="status">{texts.waiting.log}</p>;
   if (log.value.length === 0) return <p>{texts.log.empty}</p>;

@@ -1,6 +1,6 @@
 // How far a job is, why it stopped, and what can be done about it.
 
-import { cancelJob, retryJob, type Job } from "../api.ts";
+import { cancelJob, isActive, retryJob, type Job } from "../api.ts";
 import { percent } from "../format.ts";
 import { texts } from "../texts.ts";
 import { ActionButton } from "./action_button.tsx";
@@ -17,7 +17,7 @@ export function JobProgress({ job, onChanged }: Props) {
   return (
     <section class="card">
       <h2>{texts.progress.heading}</h2>
-      {(job.state === "queued" || job.state === "running") && (
+      {isActive(job) && (
         <>
           {job.attempt > 1 && <p>{texts.progress.attempt(job.attempt)}</p>}
           {job.error && <ProblemBox problem={job.error} heading={texts.progress.lastAttempt} />}

@@ -1,7 +1,7 @@
 // The 3D view: the rerun viewer on a canvas, opened on request, fed with the job's recording while it grows.
 
 import { useEffect, useRef, useState } from "preact/hooks";
-import { getBytes, getRecording, problemOf, type Job, type Problem } from "../api.ts";
+import { getBytes, getRecording, isActive, problemOf, type Job, type Problem } from "../api.ts";
 import { texts } from "../texts.ts";
 import { startViewer, viewerRuns, type Viewer } from "../viewer.ts";
 import { ProblemBox } from "./problem.tsx";
@@ -17,7 +17,6 @@ type Props = { job: Job; segments: number; name: string };
 export function View3d(props: Props) {
   const [open, setOpen] = useState(false);
   const { job } = props;
-  const active = job.state === "queued" || job.state === "running";
   if (job.state === "failed" || job.state === "cancelled") return null;
   return (
     <section class="card">
@@ -25,7 +24,7 @@ export function View3d(props: Props) {
       {!viewerRuns() && <p>{words.old}</p>}
       {viewerRuns() && !open && (
         <>
-          <p>{active ? words.aboutLive : words.about}</p>
+          <p>{isActive(job) ? words.aboutLive : words.about}</p>
           <p class="actions">
             <button type="button" class="primary" onClick={() => setOpen(true)}>
               {words.open}
@@ -99,7 +98,7 @@ function OpenView({ job, segments, name, onClose }: Props & { onClose: () => voi
           if (event.key === "Escape") closeButton.current?.focus();
         }}
       >
-        <canvas ref={canvas} role="img" aria-label={words.canvas} />
+        <canvas ref={canvas} role="application" aria-label={words.canvas} />
       </div>
       <p class="faint">{words.keys}</p>
     </>
@@ -129,8 +128,12 @@ async function feed(
   progress: (parts: number, complete: boolean) => void,
 ): Promise<void> {
   let parts = 0;
+  let generation: number | undefined;
   while (!stopped.aborted) {
     const recording = await getRecording(job);
+    // Another attempt at the job began the recording anew: it is sent from its start.
+    if (recording.segments[0]?.generation !== generation) parts = 0;
+    generation = recording.segments[0]?.generation;
     for (const segment of recording.segments.slice(parts)) {
       const bytes = await getBytes(segment.url);
       if (stopped.aborted || viewer.failure() !== null) return;

@@ -1,7 +1,7 @@
 // One run: how far it is, what came out, how good it is, everything to download, and the 3D view.
 
 import type { ComponentChildren } from "preact";
-import { deleteRun, getRun, listJobs, listProducts, type Job, type Product, type Run } from "../api.ts";
+import { deleteRun, getRun, isActive, listJobs, listProducts, type Job, type Product, type Run } from "../api.ts";
 import { lengthMm } from "../format.ts";
 import { useFollowed, useLoaded, useTitle, once } from "../hooks.ts";
 import { ConfirmButton } from "../parts/confirm_button.tsx";
@@ -19,8 +19,6 @@ import { texts } from "../texts.ts";
 
 const ACTIVE_MS = 5000;
 const IDLE_MS = 60_000;
-
-const isActive = (job: Job) => job.state === "queued" || job.state === "running";
 
 export function RunView({ run: id, job: chosen }: { run: string; job: string | null }) {
   const load = async () => ({ run: await getRun(id), jobs: await listJobs(id) });

@@ -1,7 +1,7 @@
 // The list of runs, with sending new ones at its top.
 
 import { useState } from "preact/hooks";
-import { listRuns, productPath, type Run, type RunPage } from "../api.ts";
+import { isActive, listRuns, productPath, type Run, type RunPage } from "../api.ts";
 import { percent, size } from "../format.ts";
 import { useLoaded, useTitle } from "../hooks.ts";
 import { CommandLine } from "../parts/command_line.tsx";
@@ -59,10 +59,6 @@ async function firstRuns(wanted: number): Promise<RunPage> {
     cursor = page.next_cursor ?? null;
   } while (cursor !== null && items.length < wanted);
   return { items, next_cursor: cursor };
-}
-
-function isActive(run: Run): boolean {
-  return run.state === "queued" || run.state === "running";
 }
 
 function RunRow({ run }: { run: Run }) {
