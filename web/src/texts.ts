@@ -72,7 +72,7 @@ export const texts = {
     rigFromFile: "Add a rig file…",
     rigNone: "No rig is stored yet. Add its .toml file.",
     recipe: "Recipe",
-    recipeHint: "How it is measured. The first one fits unless you know better.",
+    recipeHint: "How it is measured. The one shown fits unless you know better.",
     send: (videos: number) => (videos > 1 ? `Send ${videos} runs` : "Send the run"),
     clear: "Clear",
     cancel: "Stop sending",
