@@ -154,6 +154,8 @@ recipe! {
         restore_height: bool = true, "", flag();
         /// K of equation (9): the row's threshold between its average (0) and its maximum (1).
         k: f64 = 0.9, "", number(0.5, 0.99);
+        /// Least height of the row's maximum above its average: below it there is no spot.
+        contrast_min: f64 = 8.0, "of 255", number(0.0, 255.0);
         /// Write the stripes of every frame to `stripes.npy`.
         keep: bool = false, "", flag();
     }
@@ -182,6 +184,8 @@ recipe! {
     map: MapOptions {
         /// Map tiles held in memory; older ones wait on disk.
         tiles_in_memory: u32 = 128, "", whole(16, 100000);
+        /// Frames after which changed tiles are written while the run goes on.
+        tile_frames: u32 = 120, "frames", whole(1, 100000);
     }
     /// The rerun recording.
     recording: RecordingOptions {
@@ -259,9 +263,8 @@ impl Recipe {
             return Err(Error::input(format!("--set {key}={text}"), format!("no option '{key}'"), nearest_keys(key)));
         };
         let expected = option.expected();
-        let value = option
-            .parse(text)
-            .ok_or_else(|| Error::field("--set", key, format!("'{text}'"), expected.clone()))?;
+        let value =
+            option.parse(text).ok_or_else(|| Error::field("--set", key, format!("'{text}'"), expected.clone()))?;
         option.check("--set", &value)?;
         self.put(key, value).map_err(|_| Error::field("--set", key, format!("'{text}'"), expected))
     }
