@@ -5,6 +5,7 @@ import { percent } from "../format.ts";
 import { texts } from "../texts.ts";
 import { ActionButton } from "./action_button.tsx";
 import { ProblemBox } from "./problem.tsx";
+import { Warnings } from "./warnings.tsx";
 
 type Props = { job: Job; onChanged: () => void };
 
@@ -30,6 +31,7 @@ export function JobProgress({ job, onChanged }: Props) {
           </p>
         </>
       )}
+      <Warnings warnings={job.warnings} />
       {job.state === "failed" && (
         <>
           {job.error && <ProblemBox problem={job.error} />}

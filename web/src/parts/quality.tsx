@@ -4,6 +4,7 @@ import { getManifest, type Job, type Manifest } from "../api.ts";
 import { once, useLoaded } from "../hooks.ts";
 import { texts } from "../texts.ts";
 import { ProblemBox } from "./problem.tsx";
+import { Warnings } from "./warnings.tsx";
 
 const GAPS_SHOWN = 10;
 const words = texts.quality;
@@ -14,7 +15,7 @@ export function Quality({ job }: { job: Job }) {
     <section class="card">
       <h2>{words.heading}</h2>
       {manifest.problem && <ProblemBox problem={manifest.problem} onRetry={manifest.reload} />}
-      {job.warnings.length > 0 && <Warnings warnings={job.warnings} />}
+      <Warnings warnings={job.warnings} />
       {manifest.value && <Sentences manifest={manifest.value} />}
       {manifest.value && manifest.value.gaps.length > 0 && <Gaps gaps={manifest.value.gaps} />}
       {manifest.value && manifest.value.gaps.length + job.warnings.length === 0 && <p class="notice good">{words.good}</p>}
@@ -41,21 +42,6 @@ function Sentences({ manifest: { quality, resolution } }: { manifest: Manifest }
         <li key={sentence}>{sentence}</li>
       ))}
     </ul>
-  );
-}
-
-function Warnings({ warnings }: { warnings: string[] }) {
-  return (
-    <div class="notice warn">
-      <p class="notice-title">{words.warnings}</p>
-      <ul>
-        {warnings.map((warning) => (
-          <li key={warning} class="words">
-            {warning}
-          </li>
-        ))}
-      </ul>
-    </div>
   );
 }
 

@@ -88,6 +88,7 @@ function RunRow({ run }: { run: Run }) {
             <progress max={1} value={job.progress} aria-label={texts.progress.bar} /> {percent(job.progress)}
           </span>
         )}
+        {job.warnings.length > 0 && <span class="faint">{texts.runs.warnings(job.warnings.length)}</span>}
         {job.error && <span class="faint clamp">{job.error.detail}</span>}
       </div>
     </li>
