@@ -132,11 +132,11 @@ macro_rules! recipe {
 recipe! {
     /// How the laser line is found in a frame (METHOD.md, "Spot centroid").
     stripe: StripeOptions {
-        /// Centre of the laser's hue range, relative to the laser colour's own (green 75, red 177, blue 115;
-        /// OpenCV's half degrees). Change it for a laser of unusual wavelength or a camera with a strong tint.
+        /// Moves the laser colour's hue range (green 50 to 100, red 170 to 10, blue 100 to 130; OpenCV's half
+        /// degrees). Change it for a laser of unusual wavelength or a camera with a strong tint.
         hue_shift: f64 = 0.0, "OpenCV hue", number(-90.0, 90.0);
-        /// Half the width of the hue range. Wider finds the line on tinted walls, and more of other lights.
-        hue_half_range: f64 = 25.0, "OpenCV hue", number(2.0, 90.0);
+        /// Widens the hue range about its middle. Wider finds the line on tinted walls, and more of other lights.
+        hue_widening: f64 = 1.0, "times", number(0.1, 6.0);
         /// Least saturation of a pixel of the laser's colour.
         saturation_min: f64 = 70.0, "of 255", number(0.0, 255.0);
         /// Least brightness (HSV value) of a pixel of the laser's colour.
@@ -156,6 +156,8 @@ recipe! {
         k: f64 = 0.9, "", number(0.5, 0.99);
         /// Least height of the row's maximum above its average: below it there is no spot.
         contrast_min: f64 = 8.0, "of 255", number(0.0, 255.0);
+        /// Shortest continuous piece of the line that is believed: shorter ones are other lights or noise.
+        piece_min_rows: u32 = 12, "rows", whole(1, 1000);
         /// Write the stripes of every frame to `stripes.npy`.
         keep: bool = false, "", flag();
     }

@@ -148,12 +148,12 @@ impl Recorder {
         let opening = blueprint::opening(&id, run.name, run.recorded_at)?;
         let period = Duration::from_secs_f64(options.segment_s.clamp(0.01, 3600.0));
         let live = segments_dir.map(|dir| LiveSegments::new(dir, period)).transpose()?;
-        let budget = Budget::new(options.budget_mb);
+        let mut budget = Budget::new(options.budget_mb);
         let mut recorder = Recorder {
             store: RrdStore::create(id, opening, rrd, live)?,
             images: Images::new(options, rig, run.duration_expected_s),
-            rows: Rows::new(run.frames_expected, &budget.rows),
-            surface: Surface::new(options.points_per_profile, run.frames_expected, &budget.surface),
+            rows: Rows::new(run.frames_expected, &mut budget.rows),
+            surface: Surface::new(options.points_per_profile, run.frames_expected, &mut budget.surface),
             budget,
             rig: rig.clone(),
             run_name: run.name.to_string(),
@@ -285,7 +285,9 @@ fn halved(rgb: &[u8], width_px: u32, height_px: u32) -> Vec<u8> {
         ((at(0, 0) + at(0, 1) + at(1, 0) + at(1, 1) + 2) / 4) as u8
     };
     let rows = 0..height_px as usize / 2;
-    rows.flat_map(|r| (0..columns).flat_map(move |x| (0..3).map(move |c| (r, x, c)))).map(|(r, x, c)| mean(r, x, c)).collect()
+    rows.flat_map(|r| (0..columns).flat_map(move |x| (0..3).map(move |c| (r, x, c))))
+        .map(|(r, x, c)| mean(r, x, c))
+        .collect()
 }
 
 /// rerun's unit in space.

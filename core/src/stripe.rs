@@ -106,7 +106,7 @@ pub fn find(image: &Image, laser: &Laser, options: &StripeOptions) -> Result<Str
         }
         candidates.push(found);
     }
-    let chosen = choice::continuous(&candidates);
+    let chosen = choice::continuous(&candidates, options.piece_min_rows as usize);
     let effective_area = match laser.line {
         LineDirection::Vertical => area.data_bytes()?.to_vec(),
         LineDirection::Horizontal => {

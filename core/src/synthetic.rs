@@ -73,7 +73,11 @@ impl Simulation {
         let rig = scene.rig(size_px.0, size_px.1);
         check_size(rig.camera.width_px, rig.camera.height_px)?;
         if !(seconds > 0.0 && seconds <= MAX_SECONDS) {
-            return Err(Error::input("seconds", format!("{seconds} s"), format!("more than 0 s, at most {MAX_SECONDS} s")));
+            return Err(Error::input(
+                "seconds",
+                format!("{seconds} s"),
+                format!("more than 0 s, at most {MAX_SECONDS} s"),
+            ));
         }
         if !(0.1..=MAX_FPS).contains(&fps) {
             return Err(Error::input("fps", format!("{fps} frames/s"), format!("0.1 to {MAX_FPS} frames/s")));

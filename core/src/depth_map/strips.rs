@@ -70,17 +70,13 @@ fn pixel(image: &Image, line: LineDirection, travel: i64, row: usize) -> Option<
 pub fn strip_grid(rig: &Rig, z_mm: f64, line_x_mm: f64) -> Grid {
     let camera = &rig.camera;
     match rig.laser.line {
-        LineDirection::Vertical => Grid {
-            x_mm: line_x_mm,
-            y_mm: -camera.cy_px * z_mm / camera.fy_px,
-            mm_per_px: z_mm / camera.fx_px,
-        },
+        LineDirection::Vertical => {
+            Grid { x_mm: line_x_mm, y_mm: -camera.cy_px * z_mm / camera.fy_px, mm_per_px: z_mm / camera.fx_px }
+        }
         // World y is the image's −x there: grid row −a is image column a.
-        LineDirection::Horizontal => Grid {
-            x_mm: line_x_mm,
-            y_mm: camera.cx_px * z_mm / camera.fx_px,
-            mm_per_px: z_mm / camera.fy_px,
-        },
+        LineDirection::Horizontal => {
+            Grid { x_mm: line_x_mm, y_mm: camera.cx_px * z_mm / camera.fx_px, mm_per_px: z_mm / camera.fy_px }
+        }
     }
 }
 
@@ -168,8 +164,7 @@ mod tests {
     #[test]
     fn strips_fill_the_map_and_the_texture_lies_where_the_wall_is() {
         let rig = Rig::from_paper(128, 64, 1.0, 100.0, 1.6, LaserColour::Green);
-        let mut map =
-            SurfaceMap::create(strip_grid(&rig, 400.0, 50.0), 8, &std::env::temp_dir()).expect("map");
+        let mut map = SurfaceMap::create(strip_grid(&rig, 400.0, 50.0), 8, &std::env::temp_dir()).expect("map");
         for frame in 0..20 {
             let placed = placed(f64::from(frame) * 3.0, 3.0, frame);
             add_strip(&mut map, LineDirection::Vertical, &placed, placed.measured.cargo.as_ref()).expect("strip");
@@ -191,8 +186,7 @@ mod tests {
     #[test]
     fn a_frame_that_stands_still_gives_one_column() {
         let rig = Rig::from_paper(128, 64, 1.0, 100.0, 1.6, LaserColour::Green);
-        let mut map =
-            SurfaceMap::create(strip_grid(&rig, 400.0, 50.0), 8, &std::env::temp_dir()).expect("map");
+        let mut map = SurfaceMap::create(strip_grid(&rig, 400.0, 50.0), 8, &std::env::temp_dir()).expect("map");
         for frame in 0..5 {
             let placed = placed(0.0, 0.0, frame);
             add_strip(&mut map, LineDirection::Vertical, &placed, placed.measured.cargo.as_ref()).expect("strip");

@@ -23,7 +23,6 @@
 mod grid;
 
 use std::collections::{BTreeMap, HashMap};
-use std::io::BufWriter;
 use std::path::{Path, PathBuf};
 
 use foxglove::messages::packed_element_field::NumericType;
@@ -36,10 +35,10 @@ use mcap::records::MessageHeader;
 use mcap::{Attachment, Compression, McapError, WriteOptions, Writer};
 use nalgebra::Point3;
 use serde::Serialize;
-use tempfile::NamedTempFile;
 
 use crate::depth_map::{MapGeometry, MapWindow};
 use crate::error::{Error, Result};
+use crate::export::new_file::NewFile;
 use crate::geometry::WorldFromCamera;
 use crate::motion::Shift;
 use crate::recipe::Recipe;
@@ -92,7 +91,7 @@ struct Channel {
 /// Writes one archive.
 pub struct ArchiveWriter {
     path: PathBuf,
-    writer: Writer<BufWriter<NamedTempFile>>,
+    writer: Writer<NewFile>,
     channels: HashMap<&'static str, Channel>,
     start_ns: u64,
     latest_s: f64,
@@ -111,7 +110,7 @@ impl ArchiveWriter {
         run_name: &str,
         recorded_at: jiff::Timestamp,
     ) -> Result<ArchiveWriter> {
-        let file = BufWriter::new(super::part_file(path)?);
+        let file = NewFile::create(path)?;
         // One thread: the chunks are small, and the cores are busy with frames.
         let options = WriteOptions::new()
             .compression(Some(Compression::Zstd))
@@ -176,13 +175,13 @@ impl ArchiveWriter {
     /// # Errors
     /// As [`ArchiveWriter::frame`].
     pub fn pose(&mut self, time_s: f64, world_from_camera: &WorldFromCamera) -> Result<()> {
-        let [x, y, z] = metres(&world_from_camera.translation.vector.into()).map(f64::from);
+        let t = world_from_camera.translation.vector / 1000.0;
         let q = world_from_camera.rotation.coords;
         let transform = FrameTransform {
             timestamp: Some(self.timestamp(time_s)),
             parent_frame_id: WORLD.into(),
             child_frame_id: CAMERA.into(),
-            translation: Some(Vector3 { x, y, z }),
+            translation: Some(Vector3 { x: t.x, y: t.y, z: t.z }),
             rotation: Some(Quaternion { x: q.x, y: q.y, z: q.z, w: q.w }),
         };
         self.write("/tf", time_s, &transform)
@@ -298,10 +297,7 @@ impl ArchiveWriter {
     /// As [`ArchiveWriter::frame`].
     pub fn finish(mut self) -> Result<()> {
         self.writer.finish().map_err(|e| failed(&self.path, e))?;
-        let part = self.writer.into_inner().into_inner().map_err(|e| Error::io(&self.path, e.into_error()))?;
-        part.as_file().sync_all().map_err(|e| Error::io(&self.path, e))?;
-        part.persist(&self.path).map_err(|e| Error::io(&self.path, e.error))?;
-        Ok(())
+        self.writer.into_inner().commit()
     }
 
     fn calibration(&mut self, rig: &Rig) -> Result<()> {
@@ -392,16 +388,15 @@ fn cloud(
         data.extend([r, g, b, 255]);
         data.extend(confidence.to_le_bytes());
     }
-    let [x, y, z] = ["x", "y", "z"];
     PointCloud {
         timestamp: Some(timestamp),
         frame_id: frame_id.into(),
         pose: Some(pose_at([0.0; 3])),
         point_stride: STRIDE as u32,
         fields: fields(&[
-            (x, 0, NumericType::Float32),
-            (y, 4, NumericType::Float32),
-            (z, 8, NumericType::Float32),
+            ("x", 0, NumericType::Float32),
+            ("y", 4, NumericType::Float32),
+            ("z", 8, NumericType::Float32),
             ("red", 12, NumericType::Uint8),
             ("green", 13, NumericType::Uint8),
             ("blue", 14, NumericType::Uint8),
@@ -413,19 +408,17 @@ fn cloud(
 }
 
 fn fields(of: &[(&str, u32, NumericType)]) -> Vec<PackedElementField> {
-    of.iter().map(|(name, offset, r#type)| field(name, *offset, *r#type)).collect()
-}
-
-fn field(name: &str, offset: u32, r#type: NumericType) -> PackedElementField {
-    PackedElementField { name: name.into(), offset, r#type: r#type.into() }
+    let field = |(name, offset, kind): &(&str, u32, NumericType)| PackedElementField {
+        name: (*name).into(),
+        offset: *offset,
+        r#type: i32::from(*kind),
+    };
+    of.iter().map(field).collect()
 }
 
 /// Not turned, at a position in metres.
 fn pose_at([x, y, z]: [f64; 3]) -> Pose {
-    Pose {
-        position: Some(Vector3 { x, y, z }),
-        orientation: Some(Quaternion { x: 0.0, y: 0.0, z: 0.0, w: 1.0 }),
-    }
+    Pose { position: Some(Vector3 { x, y, z }), orientation: Some(Quaternion { x: 0.0, y: 0.0, z: 0.0, w: 1.0 }) }
 }
 
 /// The schemas' unit of length.

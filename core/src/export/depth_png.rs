@@ -102,7 +102,7 @@ fn texts(geometry: &MapGeometry, part: &Part, scale: Option<GrayScale>) -> Vec<(
 /// PNG's own size of a pixel, where its whole numbers hold it.
 fn pixels_per_metre(mm_per_px: f64) -> Option<PixelDimensions> {
     let per_metre = (1000.0 / mm_per_px).round();
-    (1.0..=f64::from(u32::MAX)).contains(&per_metre).then(|| PixelDimensions {
+    (1.0..=f64::from(u32::MAX)).contains(&per_metre).then_some(PixelDimensions {
         xppu: per_metre as u32,
         yppu: per_metre as u32,
         unit: Unit::Meter,
@@ -144,7 +144,8 @@ mod tests {
     #[test]
     fn depths_come_back_to_half_a_gray_step() {
         let folder = tempfile::tempdir().expect("temporary folder");
-        let z = |c: usize, r: usize| if (c + r) % 7 == 0 { f32::NAN } else { 800.0 + (c * 3 + r) as f32 * 0.37 };
+        let z =
+            |c: usize, r: usize| if (c + r).is_multiple_of(7) { f32::NAN } else { 800.0 + (c * 3 + r) as f32 * 0.37 };
         let mut map = GridMap::from_fn(geometry(300, 280), |c, r| (z(c, r), None));
         let scale = write(&mut map, folder.path()).expect("write").expect("measured");
         let image = read(&folder.path().join("depth.png"));

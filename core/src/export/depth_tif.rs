@@ -186,19 +186,17 @@ fn georeference(geometry: &MapGeometry) -> Vec<Entry> {
     let matrix = vec![step, 0.0, 0.0, x0, 0.0, step, 0.0, y0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 1.0];
     let citation = "Wall: x along the travel, y down, z into the wall, mm|";
     let keys: Vec<u16> = [
-        [1, 1, 0, 5],                            // version 1.1.0, five keys
+        [1, 1, 0, 4],                            // version 1.1.0, four keys
         [1024, 0, 1, 32767],                     // GTModelType: user-defined, no place on Earth
         [1025, 0, 1, 2],                         // GTRasterType: a value stands for its pixel's centre
         [1026, 34737, citation.len() as u16, 0], // GTCitation
-        [3076, 0, 1, 32767],                     // ProjLinearUnits: user-defined ...
-        [3077, 34736, 1, 0],                     // ... ProjLinearUnitSize, m
+        [3076, 0, 1, 1025],                      // ProjLinearUnits: EPSG's millimetre
     ]
     .concat();
     let unit = "<GDALMetadata><Item name=\"UNITTYPE\" sample=\"0\" role=\"unittype\">mm</Item></GDALMetadata>";
     vec![
         Entry(34264, Value::Double(matrix)),        // ModelTransformation
         Entry(34735, Value::Short(keys)),           // GeoKeyDirectory
-        Entry(34736, Value::Double(vec![0.001])),   // GeoDoubleParams
         Entry(34737, Value::Text(citation.into())), // GeoAsciiParams
         Entry(42112, Value::Text(unit.into())),     // GDAL_METADATA
     ]

@@ -196,7 +196,7 @@ mod tests {
     fn every_level_is_the_mean_of_what_was_measured_below_it() {
         let geometry = MapGeometry { x0_mm: 0.0, y0_mm: 0.0, mm_per_px: 1.0, width_px: 21, height_px: 13 };
         let value = |column: usize, row: usize| {
-            if (column * 7 + row * 3) % 5 == 0 { f32::NAN } else { (column * 100 + row) as f32 }
+            if (column * 7 + row * 3).is_multiple_of(5) { f32::NAN } else { (column * 100 + row) as f32 }
         };
         let mut map = GridMap::from_fn(geometry, |c, r| (value(c, r), Some([c as u8, r as u8, 7])));
         // The map starts left of and above the grid's origin, as after travel backwards.

@@ -10,7 +10,9 @@ use crate::depth_map::{FinishedMap, MapReader, SurfaceMap};
 use crate::error::{Error, Result};
 use crate::export::archive_mcap::ArchiveWriter;
 use crate::export::cloud_ply::CloudPlyWriter;
-use crate::export::manifest::{FileEntry, Gap, GrayScale, Manifest, Quality, SCHEMA_VERSION, list_products, sha256_of_bytes};
+use crate::export::manifest::{
+    FileEntry, Gap, GrayScale, Manifest, Quality, SCHEMA_VERSION, list_products, sha256_of_bytes,
+};
 use crate::export::npy::NpyWriter;
 use crate::export::preview::{self, PreviewText};
 use crate::export::tiles::{TileGrid, TileWriter};
@@ -54,9 +56,8 @@ impl<'a> Products<'a> {
             duration_expected_s: info.frames_announced.zip(info.frames_per_s).map(|(n, fps)| n as f64 / fps),
         };
         let segments = request.live_segments.then(|| folder.join(SEGMENTS));
-        let recorder = || {
-            Recorder::create(&recipe.recording, rig, &run, &folder.join("recording.rrd"), segments.as_deref())
-        };
+        let recorder =
+            || Recorder::create(&recipe.recording, rig, &run, &folder.join("recording.rrd"), segments.as_deref());
         let archive = || {
             ArchiveWriter::create(&folder.join("archive.mcap"), rig, recipe, &request.source_name, request.recorded_at)
         };
@@ -64,9 +65,13 @@ impl<'a> Products<'a> {
             request,
             map: None,
             tiles: None,
-            trajectory: make(wanted(ProductGroup::Trajectory), || TrajectoryWriter::create(&folder.join("trajectory.csv")))?,
+            trajectory: make(wanted(ProductGroup::Trajectory), || {
+                TrajectoryWriter::create(&folder.join("trajectory.csv"))
+            })?,
             cloud: make(wanted(ProductGroup::Cloud), || CloudPlyWriter::create(&folder.join("cloud.ply")))?,
-            stripes: make(recipe.stripe.keep, || NpyWriter::create(&folder.join("stripes.npy"), line_positions as usize))?,
+            stripes: make(recipe.stripe.keep, || {
+                NpyWriter::create(&folder.join("stripes.npy"), line_positions as usize)
+            })?,
             recorder: make(wanted(ProductGroup::Recording), recorder)?,
             archive: make(wanted(ProductGroup::Archive), archive)?,
             frames: 0,
@@ -294,11 +299,7 @@ impl<'a> Products<'a> {
         Ok(lost)
     }
 
-    fn finish_recording(
-        &mut self,
-        map: Option<&mut FinishedMap<'_>>,
-        progress: &mut Progress<'_, '_>,
-    ) -> Result<()> {
+    fn finish_recording(&mut self, map: Option<&mut FinishedMap<'_>>, progress: &mut Progress<'_, '_>) -> Result<()> {
         let Some(mut recorder) = self.recorder.take() else { return Ok(()) };
         progress.step("recording")?;
         if let Some(map) = map {

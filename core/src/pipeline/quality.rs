@@ -57,7 +57,6 @@ impl QualityCounter {
         }
     }
 
-
     /// The figures; `coverage` is the share of map pixels with a depth.
     pub(super) fn finish(self, rig: &Rig, coverage: f64) -> (Quality, Vec<Gap>, Option<Resolution>) {
         let mut quality = self.quality;
@@ -144,7 +143,9 @@ mod tests {
     #[test]
     fn neighbouring_frames_make_one_gap() {
         let mut gaps = Vec::new();
-        for (frame, reason) in [(3, "no_stripe"), (4, "no_stripe"), (4, "not_tracked"), (5, "no_stripe"), (9, "no_stripe")] {
+        for (frame, reason) in
+            [(3, "no_stripe"), (4, "no_stripe"), (4, "not_tracked"), (5, "no_stripe"), (9, "no_stripe")]
+        {
             add_gap(&mut gaps, frame, reason);
         }
         let spans: Vec<_> = gaps.iter().map(|g| (g.first_frame, g.last_frame, g.reason.as_str())).collect();

@@ -39,7 +39,8 @@ fn add_to_blueprint(messages: &mut Vec<LogMsg>, extras: Vec<Extra>) -> Result<()
     let blueprint = activation.blueprint_id.clone();
     for extra in extras {
         let at = TimePoint::default().with(Timeline::new_sequence("blueprint"), 0);
-        let chunk = Chunk::builder(extra.path).with_archetype_auto_row(at, extra.what.as_ref()).build().map_err(failed)?;
+        let chunk =
+            Chunk::builder(extra.path).with_archetype_auto_row(at, extra.what.as_ref()).build().map_err(failed)?;
         messages.insert(end, LogMsg::ArrowMsg(blueprint.clone(), chunk.to_arrow_msg().map_err(failed)?));
     }
     Ok(())
@@ -54,9 +55,11 @@ struct Extra {
 fn layout() -> (Blueprint, Vec<Extra>) {
     let mut extras = Vec::new();
 
-    let wall = Spatial3DView::new("The wall as measured so far")
-        .with_origin("/world")
-        .with_contents(["$origin/**".to_string(), format!("- /{}", entity::SPOTS), format!("- /{}", entity::CORNERS)]);
+    let wall = Spatial3DView::new("The wall as measured so far").with_origin("/world").with_contents([
+        "$origin/**".to_string(),
+        format!("- /{}", entity::SPOTS),
+        format!("- /{}", entity::CORNERS),
+    ]);
     let wall = ContainerLike::from(wall);
     for grown in [entity::SURFACE, entity::TRAJECTORY] {
         let path = format!("{}/ViewContents/overrides/{grown}/visualizers", view_path(&wall));
@@ -70,13 +73,10 @@ fn layout() -> (Blueprint, Vec<Extra>) {
         Spatial2DView::new("One row: gray (green), threshold, spot").with_origin(format!("/{}", entity::ONE_ROW)),
         &mut extras,
     );
-    let all_rows = sheet(
-        Spatial2DView::new("Threshold of every row").with_origin(format!("/{}", entity::ALL_ROWS)),
-        &mut extras,
-    );
-    let plot = |name: &str, entity: &str| {
-        ContainerLike::from(TimeSeriesView::new(name).with_origin(format!("/{entity}")))
-    };
+    let all_rows =
+        sheet(Spatial2DView::new("Threshold of every row").with_origin(format!("/{}", entity::ALL_ROWS)), &mut extras);
+    let plot =
+        |name: &str, entity: &str| ContainerLike::from(TimeSeriesView::new(name).with_origin(format!("/{entity}")));
 
     let left = Vertical::new([
         wall,
@@ -96,11 +96,7 @@ fn layout() -> (Blueprint, Vec<Extra>) {
         frame.into(),
         Horizontal::new([area.into(), Tabs::new([one_row, all_rows]).into()]).into(),
         plot("Image shift since the previous frame, px", entity::SHIFT),
-        Horizontal::new([
-            plot("Image scale", entity::SCALE),
-            plot("Rows with a spot", entity::ROWS_FOUND),
-        ])
-        .into(),
+        Horizontal::new([plot("Image scale", entity::SCALE), plot("Rows with a spot", entity::ROWS_FOUND)]).into(),
     ])
     .with_row_shares(vec![4.0, 3.0, 2.0, 2.0]);
 
@@ -131,10 +127,7 @@ fn view_path(view: &ContainerLike) -> String {
 fn sheet(view: Spatial2DView, extras: &mut Vec<Extra>) -> ContainerLike {
     let view = ContainerLike::from(view);
     let (margin, width, height) = (15.0, f64::from(charts::SHEET_WIDTH), f64::from(charts::SHEET_HEIGHT));
-    let bounds = Range2D {
-        x_range: [-margin, width + margin].into(),
-        y_range: [-margin, height + margin].into(),
-    };
+    let bounds = Range2D { x_range: [-margin, width + margin].into(), y_range: [-margin, height + margin].into() };
     extras.push(Extra {
         path: format!("{}/VisualBounds2D", view_path(&view)),
         what: Box::new(VisualBounds2D::new(components::VisualBounds2D(bounds))),

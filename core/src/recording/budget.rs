@@ -2,51 +2,64 @@
 
 /// Bytes in a megabyte, as the recipe counts them.
 const BYTES_PER_MB: f64 = 1e6;
+/// The rate is halved at most this often.
+const HALVINGS_MAX: u32 = 24;
 
 /// What one kind of content may take, and how much of it is taken.
 ///
-/// As a share fills, its content gets sparser: at full rate for the first half of the share, at half the rate
-/// for the next quarter, at a quarter for the next eighth, and so on. A run of any length fits.
+/// A run whose length is known is thinned out evenly from the start, so that it fills no more than half of the share.
+/// Otherwise content comes at full rate at first, and then at rates that fall with the length of the run: at half the
+/// rate from twice that length on, at a quarter from four times, and so on. Each doubling of the run costs the same,
+/// and the last tenth of the share is given out ever more slowly, so that a run of any length fits and its latest part
+/// is still shown.
 #[derive(Clone, Copy, Debug)]
 pub(super) struct Share {
     limit_bytes: f64,
+    /// Content up to here comes at the full (or planned) rate.
+    free_bytes: f64,
     spent_bytes: f64,
+    /// What would have been spent at the full (or planned) rate.
+    offered_bytes: f64,
+    planned: u32,
 }
 
 impl Share {
-    fn new(limit_bytes: f64) -> Share {
-        Share { limit_bytes, spent_bytes: 0.0 }
+    fn new(limit_bytes: f64, free_part: f64) -> Share {
+        Share { limit_bytes, free_bytes: free_part * limit_bytes, spent_bytes: 0.0, offered_bytes: 0.0, planned: 0 }
+    }
+
+    /// Plans for a run whose content takes `bytes` in all at full rate.
+    pub(super) fn plan(&mut self, bytes: f64) {
+        self.free_bytes = 0.5 * self.limit_bytes;
+        self.planned = (bytes / self.free_bytes).log2().ceil().clamp(0.0, f64::from(HALVINGS_MAX)) as u32;
     }
 
     /// Takes `bytes` out of the share; false, and nothing taken, where they do not fit any more.
     pub(super) fn spend(&mut self, bytes: usize) -> bool {
-        let spent_bytes = self.spent_bytes + bytes as f64;
-        if spent_bytes > self.limit_bytes {
+        let bytes = bytes as f64;
+        if self.spent_bytes + bytes > self.limit_bytes {
             return false;
         }
-        self.spent_bytes = spent_bytes;
+        self.offered_bytes += bytes * f64::from(self.thinning()).exp2();
+        self.spent_bytes += bytes;
         true
     }
 
-    /// How often the rate is to be halved by now.
+    /// How often the rate is to be halved by now, 0 to 24.
     pub(super) fn halvings(&self) -> u32 {
+        (self.planned + self.thinning()).min(HALVINGS_MAX)
+    }
+
+    /// The halvings on top of the plan.
+    fn thinning(&self) -> u32 {
+        let doublings = (self.offered_bytes / self.free_bytes).log2().floor().max(-1.0) + 1.0;
         let left = 1.0 - self.spent_bytes / self.limit_bytes;
-        (-left.max(1e-6).log2()).floor() as u32
-    }
-
-    /// How often to halve the rate from the start, so that `bytes` (all of the content at full rate) fill no
-    /// more than the half of the share that is free of further halving: the whole run is then equally dense.
-    pub(super) fn halvings_for(&self, bytes: f64) -> u32 {
-        (2.0 * bytes / self.limit_bytes).log2().ceil().clamp(0.0, 20.0) as u32
-    }
-
-    /// The share's size, bytes.
-    pub(super) fn limit_bytes(&self) -> f64 {
-        self.limit_bytes
+        let scarce = (0.1 / left.max(1e-6)).floor();
+        (doublings + scarce).min(f64::from(HALVINGS_MAX)) as u32
     }
 }
 
-/// The shares of one recording.
+/// The shares of one recording. What they leave is for the layout and the file's index.
 #[derive(Clone, Copy, Debug)]
 pub(super) struct Budget {
     /// Frames with what was found in them.
@@ -59,7 +72,7 @@ pub(super) struct Budget {
     pub(super) messages: Share,
     /// The depth image.
     pub(super) map: Share,
-    /// What cutting the recording into live segments costs on top.
+    /// What cutting the recording into live segments costs on top; not part of the file.
     pub(super) segments: Share,
 }
 
@@ -68,14 +81,14 @@ impl Budget {
     const SURFACE_MAX_BYTES: f64 = 32e6;
 
     pub(super) fn new(budget_mb: f64) -> Budget {
-        let part = |share: f64| Share::new(share * budget_mb * BYTES_PER_MB);
+        let bytes = budget_mb * BYTES_PER_MB;
         Budget {
-            images: part(0.45),
-            surface: Share::new((0.25 * budget_mb * BYTES_PER_MB).min(Self::SURFACE_MAX_BYTES)),
-            rows: part(0.20),
-            messages: part(0.01),
-            map: part(0.05),
-            segments: part(0.25),
+            images: Share::new(0.45 * bytes, 0.1),
+            surface: Share::new((0.25 * bytes).min(Self::SURFACE_MAX_BYTES), 0.15),
+            rows: Share::new(0.20 * bytes, 0.33),
+            messages: Share::new(0.01 * bytes, 1.0),
+            map: Share::new(0.05 * bytes, 1.0),
+            segments: Share::new(0.25 * bytes, 0.33),
         }
     }
 }
@@ -84,39 +97,58 @@ impl Budget {
 mod tests {
     use super::*;
 
-    #[test]
-    fn a_share_is_never_exceeded_and_thins_out_by_halves() {
-        let mut share = Share::new(1000.0);
-        let (mut step, mut kept, mut last) = (0u32, 0, 0);
-        for _ in 0..100_000 {
-            step += 1;
-            if step >= 1 << share.halvings() {
-                step = 0;
-                kept += usize::from(share.spend(10));
+    /// Offers an item of 10 bytes at every step; gives the steps at which one was taken.
+    fn taken(share: &mut Share, steps: u32) -> Vec<u32> {
+        let (mut waited, mut taken) = (0u32, Vec::new());
+        for step in 0..steps {
+            waited += 1;
+            if waited >= 1 << share.halvings() {
+                waited = 0;
+                if share.spend(10) {
+                    taken.push(step);
+                }
             }
-            assert!(share.halvings() >= last, "never denser again");
-            last = share.halvings();
+            assert!(share.spent_bytes <= share.limit_bytes);
         }
-        assert!((90..=100).contains(&kept), "{kept} of 100 fit");
-        assert!(!share.spend(1000));
+        taken
     }
 
     #[test]
-    fn a_known_length_is_planned_at_one_density() {
-        let share = Share::new(1000.0);
-        assert_eq!(share.halvings_for(400.0), 0);
-        assert_eq!(share.halvings_for(500.0), 0);
-        assert_eq!(share.halvings_for(501.0), 1);
-        assert_eq!(share.halvings_for(4000.0), 3);
-        assert_eq!(share.halvings_for(0.0), 0);
+    fn content_thins_out_and_still_reaches_the_end_of_a_long_run() {
+        for steps in [10, 100, 1_000, 10_000, 100_000, 1_000_000] {
+            let mut share = Share::new(2000.0, 0.1);
+            let taken = taken(&mut share, steps);
+            let last = taken.last().copied().unwrap_or_default();
+            assert!(f64::from(last) > 0.85 * f64::from(steps) - 1.0, "the last of {steps} is {last}: {taken:?}");
+            assert!(taken.iter().take(20).eq(&(0..20.min(steps)).collect::<Vec<_>>()), "the start is complete");
+            if steps >= 1000 {
+                assert!(taken.len() > 80, "{} of 200 used for {steps}", taken.len());
+            }
+        }
+        assert!(!Share::new(100.0, 0.1).spend(101));
+    }
+
+    #[test]
+    fn a_known_length_is_evenly_dense() {
+        for (steps, every) in [(99, 1), (100, 1), (101, 2), (799, 8), (12_800, 128)] {
+            let mut share = Share::new(2000.0, 0.1);
+            share.plan(10.0 * f64::from(steps));
+            let taken = taken(&mut share, steps);
+            assert!(taken.windows(2).all(|w| w[1] - w[0] == every), "{steps} steps: {taken:?}");
+            assert!(taken.len() as u32 >= (steps - 1) / every);
+        }
+        // Longer than announced: it thins out from there on, and still fits.
+        let mut share = Share::new(2000.0, 0.1);
+        share.plan(1000.0);
+        assert!(taken(&mut share, 100_000).len() > 150);
     }
 
     #[test]
     fn the_shares_add_up_to_the_budget() {
         for mb in [5.0, 200.0, 2000.0] {
             let b = Budget::new(mb);
-            let sum: f64 = [b.images, b.surface, b.rows, b.messages, b.map].iter().map(Share::limit_bytes).sum();
-            assert!(sum <= 0.97 * mb * BYTES_PER_MB, "{mb} MB: the rest is the layout and the file's index");
+            let sum: f64 = [b.images, b.surface, b.rows, b.messages, b.map].iter().map(|share| share.limit_bytes).sum();
+            assert!(sum <= 0.97 * mb * BYTES_PER_MB, "{mb} MB");
         }
     }
 }

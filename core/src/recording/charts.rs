@@ -30,12 +30,10 @@ pub(super) fn opening() -> Result<Vec<Chunk>> {
     let style = |colour: [u8; 3], width: f32| {
         LineStrips2D::update_fields().with_colors([colour]).with_radii([Radius::new_ui_points(width)])
     };
-    let sheet = LineStrips2D::new([
-        [[0.0, SHEET_HEIGHT], [SHEET_WIDTH, SHEET_HEIGHT]],
-        [[0.0, 0.0], [SHEET_WIDTH, 0.0]],
-    ])
-    .with_colors([[110, 110, 110]])
-    .with_labels(["gray 0", "gray 255"]);
+    let sheet =
+        LineStrips2D::new([[[0.0, SHEET_HEIGHT], [SHEET_WIDTH, SHEET_HEIGHT]], [[0.0, 0.0], [SHEET_WIDTH, 0.0]]])
+            .with_colors([[110, 110, 110]])
+            .with_labels(["gray 0", "gray 255"]);
     Ok(vec![
         fixed(&format!("{}/sheet", entity::ONE_ROW), &sheet)?,
         fixed(&format!("{}/sheet", entity::ALL_ROWS), &sheet)?,
@@ -89,7 +87,10 @@ pub(super) fn show(steps: &FrameSteps<'_>, image: &Image) -> Result<Vec<Chunk>> 
                 row(
                     &spot(),
                     at,
-                    &strips(vec![vec![[x, 0.0], [x, SHEET_HEIGHT]]], vec![format!("spot: {column_word} {across_px:.2}")]),
+                    &strips(
+                        vec![vec![[x, 0.0], [x, SHEET_HEIGHT]]],
+                        vec![format!("spot: {column_word} {across_px:.2}")],
+                    ),
                 )?,
             ]
         }

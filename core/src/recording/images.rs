@@ -90,11 +90,7 @@ impl Images {
     /// Whether the frame at this time is one to show.
     pub(super) fn due(&self, time_s: f64, share: &Share) -> bool {
         let Some(last_s) = self.last_s else { return true };
-        let planned = self.duration_expected_s.map_or(0, |duration_s| {
-            let image_bytes = self.shown_bytes as f64 / f64::from(self.shown.max(1));
-            share.halvings_for(duration_s / self.interval_s * image_bytes)
-        });
-        let interval_s = self.interval_s * f64::from(1 << planned.max(share.halvings()).min(30));
+        let interval_s = self.interval_s * f64::from(share.halvings()).exp2();
         // Half a millisecond of grace, so that 5 images a second of a 60 Hz video are every 12th frame.
         time_s - last_s >= interval_s - 0.0005
     }
@@ -116,6 +112,10 @@ impl Images {
         }
         self.shown += 1;
         self.shown_bytes += bytes;
+        if let Some(duration_s) = self.duration_expected_s {
+            let mean_bytes = self.shown_bytes as f64 / f64::from(self.shown);
+            share.plan(duration_s / self.interval_s * mean_bytes);
+        }
 
         let mut chunks = Vec::new();
         for (entity, jpeg) in jpegs {
@@ -144,12 +144,12 @@ impl Images {
     fn corners(&self, steps: &FrameSteps<'_>) -> Arrows2D {
         let corners = &steps.shift.corners;
         let shown = |p: [f32; 2]| self.to_shown(RawPixel { u_px: f64::from(p[0]), v_px: f64::from(p[1]) });
-        Arrows2D::update_fields()
-            .with_origins(corners.iter().map(|c| shown(c.from_px)))
-            .with_vectors(corners.iter().map(|c| {
+        Arrows2D::update_fields().with_origins(corners.iter().map(|c| shown(c.from_px))).with_vectors(
+            corners.iter().map(|c| {
                 let (from, to) = (shown(c.from_px), shown(c.to_px));
                 [FLOW_MAGNIFIED * (to[0] - from[0]), FLOW_MAGNIFIED * (to[1] - from[1])]
-            }))
+            }),
+        )
     }
 
     /// The image at the shown size.
@@ -157,7 +157,8 @@ impl Images {
         if (image.width_px(), image.height_px()) == (self.width_px, self.height_px) {
             return Ok(image.bgr().to_vec());
         }
-        let full = Mat::new_rows_cols_with_bytes::<Vec3b>(image.height_px() as i32, image.width_px() as i32, image.bgr())?;
+        let full =
+            Mat::new_rows_cols_with_bytes::<Vec3b>(image.height_px() as i32, image.width_px() as i32, image.bgr())?;
         self.resized(&full)
     }
 
@@ -173,7 +174,10 @@ impl Images {
     fn effective_area(&self, mut small: Vec<u8>, image: &Image, mask: &[u8]) -> Result<Vec<u8>> {
         let (width, height) = (image.width_px() as usize, image.height_px() as usize);
         if mask.len() != width * height {
-            return Err(Error::internal("recording", format!("a mask of {} for {width} x {height} pixels", mask.len())));
+            return Err(Error::internal(
+                "recording",
+                format!("a mask of {} for {width} x {height} pixels", mask.len()),
+            ));
         }
         let full = Mat::new_rows_cols_with_bytes::<u8>(height as i32, width as i32, mask)?;
         let mask = self.resized(&full)?;

@@ -45,11 +45,13 @@ pub(super) struct Rows {
     pose_moments: Vec<Moment>,
     poses: Vec<WorldFromCamera>,
     last_position: Option<[f32; 3]>,
-    halvings_planned: u32,
 }
 
 impl Rows {
-    pub(super) fn new(frames_expected: Option<u64>, share: &Share) -> Rows {
+    pub(super) fn new(frames_expected: Option<u64>, share: &mut Share) -> Rows {
+        if let Some(frames) = frames_expected {
+            share.plan(frames as f64 * ROW_BYTES as f64);
+        }
         Rows {
             frames: 0,
             current: Values::default(),
@@ -58,7 +60,6 @@ impl Rows {
             pose_moments: vec![],
             poses: vec![],
             last_position: None,
-            halvings_planned: frames_expected.map_or(0, |n| share.halvings_for((n as usize * ROW_BYTES) as f64)),
         }
     }
 
@@ -83,7 +84,7 @@ impl Rows {
         let frame = [shift.dx_px, shift.dy_px, shift.residual_px, shift.scale, Some(found)];
         self.current.iter_mut().zip(frame).for_each(|(mean, value)| mean.add(value));
         self.frames += 1;
-        if self.frames < 1 << self.halvings_planned.max(share.halvings()).min(30) || !share.spend(ROW_BYTES) {
+        if self.frames < 1 << share.halvings() || !share.spend(ROW_BYTES) {
             return;
         }
         let moment = steps.moment();

@@ -1,8 +1,6 @@
 //! Chunks of data to RRD bytes: the recording's file, and the live segments beside it.
 
 use std::collections::BTreeMap;
-use std::fs::File;
-use std::io::{BufWriter, Write};
 use std::path::{Path, PathBuf};
 use std::time::{Duration, Instant};
 
@@ -10,10 +8,10 @@ use rerun::external::re_build_info::CrateVersion;
 use rerun::external::re_log_encoding::{EncodeError, Encoder, EncodingOptions};
 use rerun::log::{Chunk, LogMsg};
 use rerun::{EntityPath, SizeBytes, StoreId};
-use tempfile::NamedTempFile;
 
 use super::budget::Share;
 use crate::error::{Error, Result};
+use crate::export::new_file::NewFile;
 
 /// Data of one entity waits for this much of it before it is written as one chunk: few large chunks load fast.
 const CHUNK_BYTES: u64 = 1 << 20;
@@ -38,7 +36,7 @@ pub struct Segment {
 pub(super) struct RrdStore {
     id: StoreId,
     path: PathBuf,
-    file: Encoder<BufWriter<NamedTempFile>>,
+    file: Encoder<NewFile>,
     waiting: BTreeMap<EntityPath, Waiting>,
     live: Option<LiveSegments>,
 }
@@ -54,7 +52,12 @@ struct Waiting {
 impl RrdStore {
     /// Starts a recording that `opening` opens: its store's info, its blueprint. Nothing is at `path` before
     /// [`RrdStore::finish`].
-    pub(super) fn create(id: StoreId, opening: Vec<LogMsg>, path: &Path, live: Option<LiveSegments>) -> Result<RrdStore> {
+    pub(super) fn create(
+        id: StoreId,
+        opening: Vec<LogMsg>,
+        path: &Path,
+        live: Option<LiveSegments>,
+    ) -> Result<RrdStore> {
         let mut file = encoder(path)?;
         for message in &opening {
             file.append(message).map_err(|e| failed(path, e))?;
@@ -179,7 +182,7 @@ impl LiveSegments {
 
     fn due(&self, costs: &Share) -> bool {
         let first = self.next_number == 0;
-        first || self.bytes >= SEGMENT_BYTES || self.last.elapsed() >= self.period * (1 << costs.halvings().min(10))
+        first || self.bytes >= SEGMENT_BYTES || self.last.elapsed() >= self.period * (1 << costs.halvings().min(8))
     }
 
     fn cut(&mut self, costs: &mut Share) -> Result<Option<Segment>> {
@@ -219,21 +222,19 @@ fn failed(path: &Path, error: EncodeError) -> Error {
 }
 
 /// An encoder into a temporary file beside `path`.
-fn encoder(path: &Path) -> Result<Encoder<BufWriter<NamedTempFile>>> {
-    let file = crate::export::part_file(path)?;
-    Encoder::new_eager(CrateVersion::LOCAL, EncodingOptions::PROTOBUF_COMPRESSED, BufWriter::new(file))
-        .map_err(|e| failed(path, e))
+fn encoder(path: &Path) -> Result<Encoder<NewFile>> {
+    let file = NewFile::create(path)?;
+    Encoder::new_eager(CrateVersion::LOCAL, EncodingOptions::PROTOBUF_COMPRESSED, file).map_err(|e| failed(path, e))
 }
 
 /// Ends the file with its index and moves it to `path`; gives its size.
-fn persist(mut encoder: Encoder<BufWriter<NamedTempFile>>, path: &Path, sync: bool) -> Result<u64> {
+fn persist(mut encoder: Encoder<NewFile>, path: &Path, sync: bool) -> Result<u64> {
     encoder.finish().map_err(|e| failed(path, e))?;
-    let mut buffer = encoder.into_inner().map_err(|e| failed(path, e))?;
-    buffer.flush().map_err(|e| Error::io(path, e))?;
-    let part = buffer.into_inner().map_err(|e| Error::io(path, e.into_error()))?;
+    let file = encoder.into_inner().map_err(|e| failed(path, e))?;
     if sync {
-        part.as_file().sync_all().map_err(|e| Error::io(path, e))?;
+        file.commit()?
+    } else {
+        file.commit_without_sync()?
     }
-    let file: File = part.persist(path).map_err(|e| Error::io(path, e.error))?;
-    Ok(file.metadata().map_err(|e| Error::io(path, e))?.len())
+    Ok(std::fs::metadata(path).map_err(|e| Error::io(path, e))?.len())
 }

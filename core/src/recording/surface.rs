@@ -29,7 +29,6 @@ pub(super) struct DepthRange {
 /// Collects the surface's points.
 pub(super) struct Surface {
     points_per_profile: usize,
-    halvings_planned: u32,
     frames_skipped: u32,
     batch: Vec<SurfacePoint>,
     last: Moment,
@@ -37,11 +36,12 @@ pub(super) struct Surface {
 }
 
 impl Surface {
-    pub(super) fn new(points_per_profile: u32, frames_expected: Option<u64>, share: &Share) -> Surface {
-        let profile_bytes = points_per_profile as usize * POINT_BYTES;
+    pub(super) fn new(points_per_profile: u32, frames_expected: Option<u64>, share: &mut Share) -> Surface {
+        if let Some(frames) = frames_expected {
+            share.plan(frames as f64 * f64::from(points_per_profile) * POINT_BYTES as f64);
+        }
         Surface {
             points_per_profile: points_per_profile as usize,
-            halvings_planned: frames_expected.map_or(0, |n| share.halvings_for(n as f64 * profile_bytes as f64)),
             frames_skipped: 0,
             batch: vec![],
             last: Moment::default(),
@@ -59,10 +59,10 @@ impl Surface {
             return;
         }
         // Halvings go in turn to the frames and to the points of a frame, so that the surface stays evenly covered.
-        let halvings = self.halvings_planned.max(share.halvings());
-        let wanted = (self.points_per_profile >> (halvings / 2).min(16)).max(PROFILE_POINTS_MIN);
+        let halvings = share.halvings();
+        let wanted = (self.points_per_profile >> (halvings / 2)).max(PROFILE_POINTS_MIN);
         self.frames_skipped += 1;
-        if self.frames_skipped < 1 << halvings.div_ceil(2).min(30) {
+        if self.frames_skipped < 1 << halvings.div_ceil(2) {
             return;
         }
         let step = steps.points.len().div_ceil(wanted);
@@ -134,7 +134,8 @@ mod tests {
 
     #[test]
     fn near_is_red_and_far_is_blue() {
-        let at = |z| SurfacePoint { point_in_world: Point3::new(0.0, 0.0, z), rgb: [255; 3], confidence: 1.0, frame: 0 };
+        let at =
+            |z| SurfacePoint { point_in_world: Point3::new(0.0, 0.0, z), rgb: [255; 3], confidence: 1.0, frame: 0 };
         let range = depth_range(&[at(100.0), at(110.0)]);
         assert!(range.near_mm < 100.0 && range.far_mm > 110.0);
         let (near, far) = (colour(&at(range.near_mm), range), colour(&at(range.far_mm), range));

@@ -16,7 +16,7 @@ use crate::rig::MAX_IMAGE_SIDE_PX;
 /// Containers that hold their own data. Play lists and other formats that name further files or
 /// addresses stay out: a hostile upload must not make the decoder open anything else.
 const CONTAINERS: &str = "mov,mp4,m4a,3gp,3g2,mj2,matroska,webm,avi,mpegts,mpeg,mpegvideo,h264,hevc,m4v,ivf,obu,flv,asf,\
-ogg,nut,mjpeg,mpjpeg,y4m,yuv4mpegpipe,jpeg_pipe,png_pipe,webp_pipe,tiff_pipe,bmp_pipe,pgm_pipe,ppm_pipe,gif,apng";
+ogg,nut,mjpeg,mpjpeg,y4m,yuv4mpegpipe,image2,jpeg_pipe,png_pipe,webp_pipe,tiff_pipe,bmp_pipe,pgm_pipe,ppm_pipe,gif,apng";
 
 /// Undecodable packets in a row after which the rest of the file is given up.
 const MAX_BAD_PACKETS_IN_A_ROW: u32 = 300;
@@ -60,6 +60,8 @@ pub(super) fn open_container(path: &Path, name: &str) -> Result<ffmpeg::format::
     let mut options = ffmpeg::Dictionary::new();
     options.set("protocol_whitelist", "file");
     options.set("format_whitelist", CONTAINERS);
+    // An image's name is a name, not a pattern that could match other files.
+    options.set("pattern_type", "none");
     // FFmpeg reads names with a colon as an address: always hand it a file's path.
     let mut url = std::ffi::OsString::from("file:");
     url.push(path.as_os_str());

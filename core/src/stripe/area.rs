@@ -64,13 +64,17 @@ fn morph(mask: &Mat, step: Step, width_px: u32, height_px: u32) -> Result<Mat> {
 }
 
 /// The hue intervals of a laser colour; red wraps around.
+///
+/// Green reaches up to 100 because a line on white turns bluish before it clips; red is narrow because
+/// wood and skin begin at 10.
 fn hue_ranges(colour: LaserColour, options: &StripeOptions) -> Vec<(f64, f64)> {
-    let centre = match colour {
-        LaserColour::Green => 75.0,
-        LaserColour::Red => 177.0,
-        LaserColour::Blue => 115.0,
-    } + options.hue_shift;
-    let (low, high) = (centre - options.hue_half_range, centre + options.hue_half_range);
+    let (centre, half) = match colour {
+        LaserColour::Green => (75.0, 25.0),
+        LaserColour::Red => (180.0, 10.0),
+        LaserColour::Blue => (115.0, 15.0),
+    };
+    let (centre, half) = (centre + options.hue_shift, half * options.hue_widening);
+    let (low, high) = (centre - half, centre + half);
     if high - low >= HUES {
         return vec![(0.0, HUES)];
     }
@@ -84,8 +88,10 @@ mod tests {
 
     #[test]
     fn red_wraps_around_the_hue_circle() {
-        let options = StripeOptions { hue_half_range: 10.0, ..StripeOptions::default() };
-        assert_eq!(hue_ranges(LaserColour::Red, &options), vec![(167.0, 180.0), (0.0, 7.0)]);
-        assert_eq!(hue_ranges(LaserColour::Green, &options), vec![(65.0, 85.0)]);
+        let options = StripeOptions::default();
+        assert_eq!(hue_ranges(LaserColour::Red, &options), vec![(170.0, 180.0), (0.0, 10.0)]);
+        assert_eq!(hue_ranges(LaserColour::Green, &options), vec![(50.0, 100.0)]);
+        let wide = StripeOptions { hue_widening: 6.0, ..options };
+        assert_eq!(hue_ranges(LaserColour::Green, &wide), vec![(0.0, 180.0)]);
     }
 }

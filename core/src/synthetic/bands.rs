@@ -3,7 +3,12 @@
 use std::sync::Mutex;
 
 /// Calls `work(first row, rows)` for bands of rows of `row_len` elements each, on all processors.
-pub(super) fn for_bands<T: Send>(data: &mut [T], row_len: usize, rows_a_band: usize, work: impl Fn(usize, &mut [T]) + Sync) {
+pub(super) fn for_bands<T: Send>(
+    data: &mut [T],
+    row_len: usize,
+    rows_a_band: usize,
+    work: impl Fn(usize, &mut [T]) + Sync,
+) {
     let threads = std::thread::available_parallelism().map_or(1, |n| n.get());
     let bands = Mutex::new(data.chunks_mut(row_len * rows_a_band).enumerate());
     let next = || bands.lock().unwrap_or_else(|poisoned| poisoned.into_inner()).next();

@@ -75,7 +75,10 @@ impl Ground {
             let (x, y) = (x0_mm + (i % STRIDE) as f64 * step_mm, y0_mm + (i / STRIDE) as f64 * step_mm);
             let (slope_x, slope_y) = window.slope(x, y, 0.5 * step_mm);
             let tilt = |axis| match self.material.gloss > 0.0 {
-                true => [14.0, 6.0].iter().map(|mm| value_noise(hash(seed, axis, 77), x / mm, y / mm)).sum::<f32>() * ROUGHNESS,
+                true => {
+                    [14.0, 6.0].iter().map(|mm| value_noise(hash(seed, axis, 77), x / mm, y / mm)).sum::<f32>()
+                        * ROUGHNESS
+                }
                 false => 0.0,
             };
             nodes.push([window.z_mm(x, y) as f32, slope_x as f32 + tilt(0), slope_y as f32 + tilt(1), *albedo]);

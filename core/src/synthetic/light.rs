@@ -50,7 +50,13 @@ pub(super) fn laser_rgb(colour: LaserColour) -> [f32; 3] {
 }
 
 impl<'a> FrameView<'a> {
-    pub(super) fn new(scene: &'a Scene, rig: &Rig, ground: &Ground, pose: &WorldFromCamera, x_range_mm: (f64, f64)) -> Self {
+    pub(super) fn new(
+        scene: &'a Scene,
+        rig: &Rig,
+        ground: &Ground,
+        pose: &WorldFromCamera,
+        x_range_mm: (f64, f64),
+    ) -> Self {
         let view = ground.view(x_range_mm.0, x_range_mm.1);
         let d = scene.wall.distance_mm;
         let place = |p: Vector3<f64>| -> [f32; 3] {

@@ -64,7 +64,8 @@ impl Trajectory {
         };
         let sway_s = if self.speed_mm_s > 0.0 { way_mm / self.speed_mm_s } else { 0.0 };
         let sway = |axis: usize| -> f64 {
-            let at = |t: f64| self.sways[axis].iter().map(|s| s.height * (s.rad_per_s * t + s.phase_rad).sin()).sum::<f64>();
+            let at =
+                |t: f64| self.sways[axis].iter().map(|s| s.height * (s.rad_per_s * t + s.phase_rad).sin()).sum::<f64>();
             at(sway_s) - at(0.0)
         };
         let position_mm = Vector3::new(way_mm + sway(0), sway(1), sway(2));
@@ -108,9 +109,8 @@ fn wheels(stream: &mut Stream) -> [Vec<Sine>; 6] {
 /// How long a steady drive would have taken to where stop-and-go is after `time_s`, s.
 fn stop_and_go_s(time_s: f64) -> f64 {
     // (end of the phase in s, speed at its end in shares of full speed); linear in between.
-    const PHASES: [(f64, f64); 9] = [
-        (0.0, 1.0), (1.2, 1.0), (1.4, 0.0), (2.2, 0.0), (2.3, -0.5), (2.8, -0.5), (2.9, 0.0), (3.0, 0.0), (3.2, 1.0),
-    ];
+    const PHASES: [(f64, f64); 9] =
+        [(0.0, 1.0), (1.2, 1.0), (1.4, 0.0), (2.2, 0.0), (2.3, -0.5), (2.8, -0.5), (2.9, 0.0), (3.0, 0.0), (3.2, 1.0)];
     const CYCLE_S: f64 = 4.0;
     let way_until = |t: f64| {
         let mut way = 0.0;

@@ -28,9 +28,7 @@ pub(super) enum Rays {
 impl Rays {
     pub(super) fn new(camera: &Camera) -> Rays {
         let (width, height) = (camera.width_px as usize, camera.height_px as usize);
-        let ray = |column: usize, row: usize| {
-            camera.undistort(RawPixel { u_px: column as f64, v_px: row as f64 })
-        };
+        let ray = |column: usize, row: usize| camera.undistort(RawPixel { u_px: column as f64, v_px: row as f64 });
         if !camera.has_distortion() {
             return Rays::Pinhole(
                 (0..width).map(|c| ray(c, 0).x as f32).collect(),

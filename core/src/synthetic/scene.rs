@@ -281,7 +281,11 @@ impl Scene {
                 cy_px: (height - 1.0) / 2.0,
                 distortion: self.distortion,
             },
-            laser: Laser { colour: self.colour, line: self.line, plane: Plane { normal, offset_mm: BASELINE_MM * sine } },
+            laser: Laser {
+                colour: self.colour,
+                line: self.line,
+                plane: Plane { normal, offset_mm: BASELINE_MM * sine },
+            },
         }
     }
 }

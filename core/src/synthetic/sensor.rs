@@ -17,7 +17,8 @@ const CURVE_STEPS: usize = 65536;
 
 impl Sensor {
     pub(super) fn new(noise: Option<SensorNoise>) -> Sensor {
-        let curve = (0..CURVE_STEPS).map(|i| (255.0 * srgb(i as f64 / (CURVE_STEPS - 1) as f64)).round() as u8).collect();
+        let curve =
+            (0..CURVE_STEPS).map(|i| (255.0 * srgb(i as f64 / (CURVE_STEPS - 1) as f64)).round() as u8).collect();
         Sensor { noise, normals: Normals::new(), curve }
     }
 
@@ -95,7 +96,9 @@ mod tests {
     #[test]
     fn the_curve_is_srgb() {
         let clean = Sensor::new(None);
-        for (linear, stored) in [(0.0, 0), (0.0031308, 10), (0.2140, 127), (0.5, 188), (1.0, 255), (7.0, 255), (-1.0, 0)] {
+        for (linear, stored) in
+            [(0.0, 0), (0.0031308, 10), (0.2140, 127), (0.5, 188), (1.0, 255), (7.0, 255), (-1.0, 0)]
+        {
             assert_eq!(clean.encode(linear), stored, "{linear}");
         }
     }

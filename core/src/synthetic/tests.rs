@@ -133,9 +133,8 @@ fn a_steady_run_shifts_by_focal_length_times_way_over_distance() {
         assert!(truth.dy_px.abs() < 1e-6 && (truth.scale - 1.0).abs() < 1e-6);
     }
     // With the line along the rows the robot moves along the image's columns.
-    let horizontal = Simulation::new(
-        Scene { line: LineDirection::Horizontal, ..simulation.scene().clone() }, SIZE, 30.0, 1.0, 5,
-    );
+    let horizontal =
+        Simulation::new(Scene { line: LineDirection::Horizontal, ..simulation.scene().clone() }, SIZE, 30.0, 1.0, 5);
     let (_, truth) = horizontal.expect("valid").render(1);
     assert!((truth.dy_px - expected).abs() < 1e-3 && truth.dx_px.abs() < 1e-6, "{} {}", truth.dx_px, truth.dy_px);
 }
@@ -215,7 +214,8 @@ fn a_camera_video_comes_back_by_ffmpeg() {
     })
     .expect("written");
     let video = out.join("video.mp4");
-    let arguments = ["-i", "FILE", "-f", "rawvideo", "-pix_fmt", "bgr24", "-sws_flags", "accurate_rnd+full_chroma_int", "-"];
+    let arguments =
+        ["-i", "FILE", "-f", "rawvideo", "-pix_fmt", "bgr24", "-sws_flags", "accurate_rnd+full_chroma_int", "-"];
     let decoded = ffmpeg("ffmpeg", &arguments, &video);
     let frame_bytes = 3 * 640 * 360;
     assert_eq!(decoded.len(), 42 * frame_bytes, "every frame, once");
@@ -235,7 +235,17 @@ fn a_camera_video_comes_back_by_ffmpeg() {
         });
         assert!(worst_luma.sum::<f64>() / (640.0 * 360.0) < 2.5, "frame {frame}: not the same picture");
     }
-    let probe = ffmpeg("ffprobe", &["-show_entries", "stream=nb_frames,has_b_frames,color_space,color_range,avg_frame_rate:packet=flags", "-of", "compact", "FILE"], &video);
+    let probe = ffmpeg(
+        "ffprobe",
+        &[
+            "-show_entries",
+            "stream=nb_frames,has_b_frames,color_space,color_range,avg_frame_rate:packet=flags",
+            "-of",
+            "compact",
+            "FILE",
+        ],
+        &video,
+    );
     let probe = String::from_utf8_lossy(&probe);
     for word in ["nb_frames=42", "has_b_frames=0", "color_space=bt709", "color_range=tv", "avg_frame_rate=30/1"] {
         assert!(probe.contains(word), "{word} in {probe}");
@@ -269,7 +279,8 @@ fn lossless_video_and_images_hold_the_very_pixels() {
     let (expected, _) = simulation.render(3);
     assert_eq!(image, expected.bgr());
     assert_eq!(&video[3 * expected.bgr().len()..][..expected.bgr().len()], expected.bgr());
-    let (rows, columns, stripes) = crate::export::npy::read_f32(&folder.path().join("b/truth/stripes.npy")).expect("stripes");
+    let (rows, columns, stripes) =
+        crate::export::npy::read_f32(&folder.path().join("b/truth/stripes.npy")).expect("stripes");
     assert_eq!((rows, columns), (5, 181));
     assert_eq!(stripes[3 * 181..4 * 181], simulation.render(3).1.stripe_across_px[..]);
     assert_eq!(Rig::load(&folder.path().join("b/rig.toml")).expect("rig"), *simulation.rig());
@@ -283,7 +294,8 @@ fn a_stopped_or_refused_run_leaves_nothing_behind() {
     let stopped = write_run(&run, &out, Output::Images, &mut |_, _| std::ops::ControlFlow::Break(()));
     assert_eq!(stopped.expect_err("stopped").kind(), "cancelled");
     let odd = Simulation::new(Scene::named("wall").expect("wall"), (321, 181), 30.0, 1.0, 1).expect("valid");
-    let refused = write_run(&odd, &out, Output::Video(Quality::Camera), &mut |_, _| std::ops::ControlFlow::Continue(()));
+    let refused =
+        write_run(&odd, &out, Output::Video(Quality::Camera), &mut |_, _| std::ops::ControlFlow::Continue(()));
     assert!(refused.expect_err("odd").to_string().contains("even"));
     assert_eq!(std::fs::read_dir(folder.path()).expect("folder").count(), 0);
     std::fs::create_dir(&out).expect("folder");

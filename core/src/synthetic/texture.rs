@@ -57,7 +57,9 @@ fn clouds(canvas: &mut Canvas, material: &Material, scale: f64, seed: u64) {
         .iter()
         .enumerate()
         .filter(|(_, (length, _))| length * scale >= finest_mm)
-        .map(|(i, (length, share))| (1.0 / (length * scale), (share * material.contrast) as f32, hash(seed, i as i64, 1)))
+        .map(|(i, (length, share))| {
+            (1.0 / (length * scale), (share * material.contrast) as f32, hash(seed, i as i64, 1))
+        })
         .collect();
     for row in 0..canvas.rows {
         let y = canvas.y0_mm + row as f64 * canvas.step_mm;
@@ -115,7 +117,8 @@ fn cracks(canvas: &mut Canvas, scale: f64, seed: u64) {
                 if along < 0.0 || along >= scale {
                     return 1.0;
                 }
-                let cover = ((half_mm + 0.5 * step_mm - across) / step_mm).clamp(0.0, (2.0 * half_mm / step_mm).min(1.0));
+                let cover =
+                    ((half_mm + 0.5 * step_mm - across) / step_mm).clamp(0.0, (2.0 * half_mm / step_mm).min(1.0));
                 1.0 - depth * cover as f32
             });
             (x, y) = (x + scale * cosine, y + scale * sine);

@@ -170,7 +170,12 @@ impl Wall {
                 let length_mm = 420.0 / 1.6f64.powi(i) * stream.between(0.9, 1.1);
                 let (sine, cosine) = stream.between(0.0, std::f64::consts::PI).sin_cos();
                 let k = std::f64::consts::TAU / length_mm;
-                [k * cosine, k * sine, stream.between(0.0, std::f64::consts::TAU), self.waves_mm * 0.4 / 1.45f64.powi(i)]
+                [
+                    k * cosine,
+                    k * sine,
+                    stream.between(0.0, std::f64::consts::TAU),
+                    self.waves_mm * 0.4 / 1.45f64.powi(i),
+                ]
             })
             .collect()
     }

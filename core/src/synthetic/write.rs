@@ -73,7 +73,11 @@ fn check_new(out_dir: &Path) -> Result<PathBuf> {
         Err(e) => return Err(Error::io(out_dir, e)),
     };
     if taken {
-        return Err(Error::input(out_dir.display().to_string(), "a folder with files in it", "a new or an empty folder"));
+        return Err(Error::input(
+            out_dir.display().to_string(),
+            "a folder with files in it",
+            "a new or an empty folder",
+        ));
     }
     let parent = match out_dir.parent() {
         Some(parent) if !parent.as_os_str().is_empty() => parent.to_path_buf(),
@@ -231,7 +235,8 @@ fn write_surface(simulation: &Simulation, folder: &Path) -> Result<()> {
     let mut surface = NpyWriter::create(&folder.join("surface_z_mm.npy"), columns)?;
     for row in 0..rows {
         let y = y0 + row as f64 * step;
-        let z = |column: usize| if wall.exists(y) { window.z_mm(x0 + column as f64 * step, y) as f32 } else { f32::NAN };
+        let z =
+            |column: usize| if wall.exists(y) { window.z_mm(x0 + column as f64 * step, y) as f32 } else { f32::NAN };
         surface.push_row(&(0..columns).map(z).collect::<Vec<f32>>())?;
     }
     surface.finish()?;

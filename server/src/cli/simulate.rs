@@ -77,7 +77,10 @@ enum MotionArg {
 
 fn scene_list() -> String {
     let lines: Vec<String> = SCENES.iter().map(|(name, text)| format!("  {name:<12} {text}")).collect();
-    format!("Scenes:\n{}\n\nDIR gets video.mp4, rig.toml and truth/ (stripes.npy, measurable.npy, trajectory.csv,\nsurface_z_mm.npy, surface.json).", lines.join("\n"))
+    format!(
+        "Scenes:\n{}\n\nDIR gets video.mp4, rig.toml and truth/ (stripes.npy, measurable.npy, trajectory.csv,\nsurface_z_mm.npy, surface.json).",
+        lines.join("\n")
+    )
 }
 
 /// Runs the command; the progress goes to the terminal's error stream.

@@ -7,8 +7,8 @@ use crate::error::{Error, Result};
 /// A colour: red, green, blue.
 pub(super) type Rgb = [u8; 3];
 
-/// Inter Medium (SIL Open Font License), cut down to Latin, Greek and Cyrillic.
-const FONT: &[u8] = include_bytes!("Inter-Medium-subset.otf");
+/// Ubuntu Light, from a library of fonts.
+const FONT: &[u8] = epaint_default_fonts::UBUNTU_LIGHT;
 
 /// Where a text's given point lies in it.
 #[derive(Clone, Copy, PartialEq)]

@@ -6,8 +6,8 @@ use super::canvas::Rgb;
 /// that the ramp also works in gray and for the colour-blind; it stops well above black, so that the relief's
 /// shadows can still be seen on it.
 const RAMP: [[f64; 3]; 6] = [
-    [0.945, 0.075, 95.0],
-    [0.860, 0.130, 82.0],
+    [0.910, 0.105, 96.0],
+    [0.830, 0.140, 84.0],
     [0.740, 0.135, 135.0],
     [0.620, 0.105, 190.0],
     [0.500, 0.110, 245.0],

@@ -48,10 +48,9 @@ fn title(canvas: &mut Canvas, sheet: &Sheet<'_>, right_end: i64) {
     canvas.text(MARGIN_PX as f32, 70.0, &title, style(TITLE_PX, INK, Align::Left));
     let map = &sheet.geometry;
     let facts = format!(
-        "{} × {}   ·   {} per pixel   ·   {:.0} % measured",
-        layout::length(map.width_px as f64 * map.mm_per_px),
-        layout::length(map.height_px as f64 * map.mm_per_px),
-        layout::length(map.mm_per_px),
+        "{}   ·   {} mm per pixel   ·   {:.0} % measured",
+        layout::size(map.width_px as f64 * map.mm_per_px, map.height_px as f64 * map.mm_per_px),
+        (map.mm_per_px * 1000.0).round() / 1000.0,
         // Not 100 before all is there.
         (100.0 * sheet.coverage).floor(),
     );

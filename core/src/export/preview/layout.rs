@@ -97,13 +97,12 @@ pub(super) fn label(value: f64, step: f64) -> String {
     if is_zero { text.replace('-', "") } else { text.replace('-', "\u{2212}") }
 }
 
-/// A length for people: mm up to a metre, then m.
-pub(super) fn length(mm: f64) -> String {
-    match mm {
-        mm if mm >= 10_000.0 => format!("{:.1} m", mm / 1000.0),
-        mm if mm >= 1000.0 => format!("{:.2} m", mm / 1000.0),
-        mm if mm >= 10.0 => format!("{mm:.0} mm"),
-        mm => format!("{} mm", (mm * 100.0).round() / 100.0),
+/// Width and height for people: in mm, or in m from a metre on.
+pub(super) fn size(width_mm: f64, height_mm: f64) -> String {
+    match width_mm.max(height_mm) {
+        large if large >= 10_000.0 => format!("{:.1} × {:.2} m", width_mm / 1000.0, height_mm / 1000.0),
+        large if large >= 1000.0 => format!("{:.2} × {:.2} m", width_mm / 1000.0, height_mm / 1000.0),
+        _ => format!("{width_mm:.0} × {height_mm:.0} mm"),
     }
 }
 
