@@ -12,10 +12,16 @@ pub(super) struct Candidate {
     pub contrast: f32,
 }
 
+/// Sideways motion that a line may have from row to row at no great cost, px: a pipe's edge.
+const FREE_SLOPE_PX: f32 = 1.5;
+/// Cost of a pixel of such motion, in gray values of contrast.
+const SLOPE_COST: f32 = 0.5;
+/// Cost of a pixel beyond it.
+const JUMP_COST: f32 = 8.0;
 /// The cost of a jump does not grow past this many pixels: a real step may be larger.
-const LARGEST_COUNTED_JUMP_PX: f32 = 40.0;
-/// Cost of one pixel of jump, in gray values of contrast.
-const COST_PER_PX: f32 = 8.0;
+const LARGEST_COUNTED_JUMP_PX: f32 = 400.0;
+/// Ends of paths that are followed at once.
+const OPEN_ENDS: usize = 16;
 
 /// Two spots belong to one piece of the line when they lie no further apart than this per row between them.
 const PIECE_SLOPE_PX: f32 = 4.0;
@@ -53,37 +59,48 @@ fn drop_short_pieces(line: &mut [Option<Candidate>], piece_min_rows: usize) {
     }
 }
 
+/// The path with the greatest sum of contrast less the cost of its jumps. It may pass rows by, also such
+/// as hold spots: a second line shall not be joined to the first one's gaps.
 fn strongest_path(rows: &[Vec<Candidate>]) -> Vec<Option<Candidate>> {
     if rows.iter().all(|row| row.len() < 2) {
         return rows.iter().map(|row| row.first().copied()).collect();
     }
-    // best[i][j]: the best sum of a path that ends in candidate j of the i-th row that has any.
-    let filled: Vec<usize> = (0..rows.len()).filter(|i| !rows[*i].is_empty()).collect();
-    let mut best: Vec<Vec<(f32, usize)>> = Vec::with_capacity(filled.len());
-    for (position, &row) in filled.iter().enumerate() {
-        let scores = rows[row].iter().map(|candidate| {
-            let Some(previous) = position.checked_sub(1) else { return (candidate.contrast, 0) };
-            let before = &rows[filled[previous]];
-            let gap_rows = (row - filled[previous]) as f32;
-            let arrive = |(index, from): (usize, &Candidate)| {
-                let jump_px = ((candidate.across_px - from.across_px).abs() / gap_rows).min(LARGEST_COUNTED_JUMP_PX);
-                (best[previous][index].0 - COST_PER_PX * jump_px, index)
-            };
-            let (score, index) =
-                before.iter().enumerate().map(arrive).fold((f32::MIN, 0), |a, b| if b.0 > a.0 { b } else { a });
-            (score + candidate.contrast, index)
-        });
-        let scores: Vec<_> = scores.collect();
-        best.push(scores);
+    let mut steps: Vec<Step> = Vec::new();
+    let mut ends: Vec<usize> = Vec::new();
+    for (row, candidates) in rows.iter().enumerate() {
+        for candidate in candidates {
+            let arrive = |from: &usize| (steps[*from].score - steps[*from].cost_to(row, candidate), Some(*from));
+            let begin = (0.0, None);
+            let (score, from) = ends.iter().map(arrive).fold(begin, |a, b| if b.0 > a.0 { b } else { a });
+            steps.push(Step { row, candidate: *candidate, score: score + candidate.contrast, from });
+        }
+        ends.extend(steps.len() - candidates.len()..steps.len());
+        ends.sort_by(|a, b| steps[*b].score.total_cmp(&steps[*a].score));
+        ends.truncate(OPEN_ENDS);
     }
-    let mut chosen = vec![None; rows.len()];
-    let last = best.last().map_or(&[][..], Vec::as_slice);
-    let mut index = (0..last.len()).fold(0, |a, b| if last[b].0 > last[a].0 { b } else { a });
-    for (position, &row) in filled.iter().enumerate().rev() {
-        chosen[row] = Some(rows[row][index]);
-        index = best[position][index].1;
+    let mut path = vec![None; rows.len()];
+    let mut at = ends.first().copied();
+    while let Some(index) = at {
+        path[steps[index].row] = Some(steps[index].candidate);
+        at = steps[index].from;
     }
-    chosen
+    path
+}
+
+/// The best path that ends in one candidate.
+struct Step {
+    row: usize,
+    candidate: Candidate,
+    score: f32,
+    from: Option<usize>,
+}
+
+impl Step {
+    fn cost_to(&self, row: usize, candidate: &Candidate) -> f32 {
+        let sideways_px = (candidate.across_px - self.candidate.across_px).abs();
+        let jump_px = (sideways_px - FREE_SLOPE_PX * (row - self.row) as f32).clamp(0.0, LARGEST_COUNTED_JUMP_PX);
+        SLOPE_COST * sideways_px.min(LARGEST_COUNTED_JUMP_PX) + JUMP_COST * jump_px
+    }
 }
 
 #[cfg(test)]
@@ -113,6 +130,18 @@ mod tests {
         let chosen = continuous(&rows, 1);
         let first = chosen[0].expect("a spot").across_px;
         assert!(chosen.iter().all(|c| c.is_some_and(|c| c.across_px == first)));
+    }
+
+    #[test]
+    fn a_gap_in_the_line_is_not_filled_from_another_line() {
+        let rows: Vec<Vec<Candidate>> = (0..200)
+            .map(|i| {
+                if (60..100).contains(&i) { vec![spot(300.0, 60.0)] } else { vec![spot(50.0, 60.0), spot(300.0, 50.0)] }
+            })
+            .collect();
+        let chosen = continuous(&rows, 12);
+        let first = chosen[0].expect("a spot").across_px;
+        assert!(chosen.iter().flatten().all(|c| c.across_px == first));
     }
 
     #[test]
