@@ -1,25 +1,27 @@
 # Everything a person does with Stria's sources. `make demo` and `make test` need only Debian 12, Rust, Node and make.
-.PHONY: demo test check setup web build clean
+.PHONY: demo test check setup web build
 
-demo: setup build
+# Sets up, builds, makes a realistic run, processes it through the server and says which URL to open.
+demo: build
 	docker/demo.sh
 
-test: setup build
-	docker/test.sh
+# Sets up and runs every test: unit, truth, formats, service, browser.
+test: build
+	cargo test --release --locked --workspace
+	cd tests/browser && npm test
 
-check: setup build
+# Format, lints and docs as errors.
+check: setup web
 	cargo fmt --all --check
 	cargo clippy --release --locked --workspace --all-targets -- -D warnings
 	RUSTDOCFLAGS="-D warnings" cargo doc --release --locked --workspace --no-deps
+	cd web && npm run generate:check
 
 setup:
 	docker/set-up.sh
 
-web:
+web: setup
 	cd web && npm ci --no-audit --no-fund && npm run build
 
-build: web
-	cargo build --release --locked
-
-clean:
-	rm -rf target web/dist web/node_modules
+build: setup web
+	cargo build --release --locked --workspace

@@ -1,4 +1,19 @@
-//! One file per format.
+//! One file per format, each with a reader in its tests.
+//!
+//! Every writer works under a temporary name beside the final one and renames at the end, so that no file
+//! under its final name is ever incomplete. Every writer's memory is bounded whatever the length of the run:
+//! maps are read in windows through [`crate::depth_map::MapReader`].
 
+pub mod archive_mcap;
+pub mod cloud_ply;
+pub mod depth_png;
+pub mod depth_tif;
 pub mod manifest;
+pub mod new_file;
 pub mod npy;
+pub mod parts;
+pub mod preview;
+mod pyramid;
+pub mod texture;
+pub mod tiles;
+pub mod trajectory_csv;

@@ -132,11 +132,11 @@ macro_rules! recipe {
 recipe! {
     /// How the laser line is found in a frame (METHOD.md, "Spot centroid").
     stripe: StripeOptions {
-        /// Centre of the laser's hue range, relative to the laser colour's own (green 75, red 177, blue 115;
-        /// OpenCV's half degrees). Change it for a laser of unusual wavelength or a camera with a strong tint.
+        /// Moves the laser colour's hue range (green 50 to 100, red 170 to 10, blue 100 to 130; OpenCV's half
+        /// degrees). Change it for a laser of unusual wavelength or a camera with a strong tint.
         hue_shift: f64 = 0.0, "OpenCV hue", number(-90.0, 90.0);
-        /// Half the width of the hue range. Wider finds the line on tinted walls, and more of other lights.
-        hue_half_range: f64 = 25.0, "OpenCV hue", number(2.0, 90.0);
+        /// Widens the hue range about its middle. Wider finds the line on tinted walls, and more of other lights.
+        hue_widening: f64 = 1.0, "times", number(0.1, 6.0);
         /// Least saturation of a pixel of the laser's colour.
         saturation_min: f64 = 70.0, "of 255", number(0.0, 255.0);
         /// Least brightness (HSV value) of a pixel of the laser's colour.
@@ -154,6 +154,10 @@ recipe! {
         restore_height: bool = true, "", flag();
         /// K of equation (9): the row's threshold between its average (0) and its maximum (1).
         k: f64 = 0.9, "", number(0.5, 0.99);
+        /// Least height of the row's maximum above its average: below it there is no spot.
+        contrast_min: f64 = 8.0, "of 255", number(0.0, 255.0);
+        /// Shortest continuous piece of the line that is believed: shorter ones are other lights or noise.
+        piece_min_rows: u32 = 12, "rows", whole(1, 1000);
         /// Write the stripes of every frame to `stripes.npy`.
         keep: bool = false, "", flag();
     }
@@ -182,6 +186,8 @@ recipe! {
     map: MapOptions {
         /// Map tiles held in memory; older ones wait on disk.
         tiles_in_memory: u32 = 128, "", whole(16, 100000);
+        /// Frames after which changed tiles are written while the run goes on.
+        tile_frames: u32 = 120, "frames", whole(1, 100000);
     }
     /// The rerun recording.
     recording: RecordingOptions {
@@ -259,9 +265,8 @@ impl Recipe {
             return Err(Error::input(format!("--set {key}={text}"), format!("no option '{key}'"), nearest_keys(key)));
         };
         let expected = option.expected();
-        let value = option
-            .parse(text)
-            .ok_or_else(|| Error::field("--set", key, format!("'{text}'"), expected.clone()))?;
+        let value =
+            option.parse(text).ok_or_else(|| Error::field("--set", key, format!("'{text}'"), expected.clone()))?;
         option.check("--set", &value)?;
         self.put(key, value).map_err(|_| Error::field("--set", key, format!("'{text}'"), expected))
     }

@@ -232,7 +232,10 @@ impl Rig {
             subject,
             "image size",
             format!("{width_px}x{height_px} px"),
-            format!("{}x{} px, the size that rig '{}' was calibrated for", camera.width_px, camera.height_px, self.name),
+            format!(
+                "{}x{} px, the size that rig '{}' was calibrated for",
+                camera.width_px, camera.height_px, self.name
+            ),
         ))
     }
 }
@@ -264,7 +267,9 @@ impl Camera {
             }
             (Some(fov), None, None) => return bad("camera.fov_deg", format!("{fov}°"), "1° to 170°"),
             (None, Some(fx), fy) => (fx, fy.unwrap_or(fx)),
-            (Some(_), _, _) => return bad("camera.fov_deg", "given beside fx_px or fy_px".into(), "one of the two forms"),
+            (Some(_), _, _) => {
+                return bad("camera.fov_deg", "given beside fx_px or fy_px".into(), "one of the two forms");
+            }
             (None, None, _) => return bad("camera.fx_px", "missing".into(), "fx_px and fy_px, or fov_deg"),
         };
         for (field, f) in [("camera.fx_px", fx_px), ("camera.fy_px", fy_px)] {
@@ -280,14 +285,19 @@ impl Camera {
             }
         }
         if ![0, 4, 5, 8].contains(&file.distortion.len()) {
-            return bad("camera.distortion", format!("{} values", file.distortion.len()), "4, 5 or 8 values (k1 k2 p1 p2 k3 …)");
+            return bad(
+                "camera.distortion",
+                format!("{} values", file.distortion.len()),
+                "4, 5 or 8 values (k1 k2 p1 p2 k3 …)",
+            );
         }
         let mut distortion = [0.0; 8];
         distortion[..file.distortion.len()].copy_from_slice(&file.distortion);
         if distortion.iter().any(|d| !d.is_finite() || d.abs() > 100.0) {
             return bad("camera.distortion", format!("{:?}", file.distortion), "finite values, at most 100 each");
         }
-        let camera = Camera { width_px: file.width_px, height_px: file.height_px, fx_px, fy_px, cx_px, cy_px, distortion };
+        let camera =
+            Camera { width_px: file.width_px, height_px: file.height_px, fx_px, fy_px, cx_px, cy_px, distortion };
         camera.check_lens(subject)?;
         Ok(camera)
     }
@@ -351,7 +361,10 @@ impl Camera {
 
     /// Where a point of the camera's frame (mm, z > 0) appears in the image.
     pub fn project(&self, point_in_camera: &Point3<f64>) -> RawPixel {
-        self.distort(UndistortedRay { x: point_in_camera.x / point_in_camera.z, y: point_in_camera.y / point_in_camera.z })
+        self.distort(UndistortedRay {
+            x: point_in_camera.x / point_in_camera.z,
+            y: point_in_camera.y / point_in_camera.z,
+        })
     }
 
     fn distort_normalised(&self, x: f64, y: f64) -> (f64, f64) {
@@ -378,14 +391,22 @@ impl Laser {
                 let normal = Vector3::from(n);
                 let length = normal.norm();
                 if !(length > 1e-6 && length.is_finite() && offset.is_finite()) {
-                    return bad("laser.plane_normal", format!("{n:?}, offset {offset} mm"), "a finite vector that is not zero");
+                    return bad(
+                        "laser.plane_normal",
+                        format!("{n:?}, offset {offset} mm"),
+                        "a finite vector that is not zero",
+                    );
                 }
                 Plane { normal: normal / length, offset_mm: offset / length }
             }
             (None, None, Some(baseline), angle) => {
                 let angle_deg = angle.unwrap_or(90.0);
                 if !(angle_deg > 5.0 && angle_deg < 175.0) {
-                    return bad("laser.angle_deg", format!("{angle_deg}°"), "5° to 175° (90° is parallel to the optical axis)");
+                    return bad(
+                        "laser.angle_deg",
+                        format!("{angle_deg}°"),
+                        "5° to 175° (90° is parallel to the optical axis)",
+                    );
                 }
                 if !baseline.is_finite() {
                     return bad("laser.baseline_mm", format!("{baseline} mm"), "a finite distance");
@@ -429,7 +450,11 @@ impl Laser {
         Err(Error::field(
             subject,
             "laser.plane_normal",
-            format!("{:?}, offset {} mm: outside the camera's view", self.plane.normal.as_slice(), self.plane.offset_mm),
+            format!(
+                "{:?}, offset {} mm: outside the camera's view",
+                self.plane.normal.as_slice(),
+                self.plane.offset_mm
+            ),
             "a plane that crosses the image in front of the camera",
         ))
     }
@@ -491,6 +516,9 @@ mod tests {
             let message = Rig::from_toml("rig.toml", &text).expect_err(to).to_string();
             assert!(message.contains(field) && message.contains("rig.toml"), "{message}");
         }
-        assert!(Rig::from_toml("rig", &PINHOLE.replace("baseline_mm", "basline_mm")).is_err(), "unknown keys are refused");
+        assert!(
+            Rig::from_toml("rig", &PINHOLE.replace("baseline_mm", "basline_mm")).is_err(),
+            "unknown keys are refused"
+        );
     }
 }

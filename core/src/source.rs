@@ -1,8 +1,20 @@
-//! Where frames come from: video files, folders of images.
+//! Where frames come from: video files, folders of images, one trait over both.
 
+mod encoded;
+mod folder;
 mod image;
+mod video;
 
+use std::path::{Path, PathBuf};
+use std::sync::Once;
+
+pub use encoded::{EncodedFrames, encoded_frames};
 pub use image::Image;
+
+use crate::error::{Error, Result};
+
+/// Frames a second of a folder of images when nothing is said.
+pub const DEFAULT_FOLDER_FPS: f64 = 30.0;
 
 /// One image of a run.
 pub struct Frame {
@@ -12,6 +24,67 @@ pub struct Frame {
     pub time_s: f64,
     /// The pixels.
     pub image: Image,
+}
+
+/// What a source says of itself before it is read.
+#[derive(Clone, Debug, PartialEq)]
+pub struct SourceInfo {
+    /// Columns.
+    pub width_px: u32,
+    /// Rows.
+    pub height_px: u32,
+    /// Frames, where the source announces them; a file that was cut holds fewer.
+    pub frames_announced: Option<u64>,
+    /// Frames a second, where the source announces them.
+    pub frames_per_s: Option<f64>,
+    /// The files it is made of, in order.
+    pub files: Vec<PathBuf>,
+}
+
+/// A run's images in order.
+pub trait Source: Send {
+    /// What the source says of itself.
+    fn info(&self) -> &SourceInfo;
+
+    /// The next frame; `None` at the end of what can be read.
+    fn next_frame(&mut self) -> Result<Option<Frame>>;
+
+    /// What went wrong so far without ending the run, in words for people.
+    fn warnings(&self) -> Vec<String>;
+}
+
+/// Opens a video file or a folder of images. `name` names it in messages; `fps` is for folders.
+///
+/// # Errors
+/// [`Error::Input`] where it is neither, is empty, cannot be decoded or has sides outside 16 to
+/// [`crate::rig::MAX_IMAGE_SIDE_PX`] px.
+pub fn open(path: &Path, name: &str, fps: Option<f64>) -> Result<Box<dyn Source>> {
+    if let Some(fps) = fps
+        && !(0.01..=10_000.0).contains(&fps)
+    {
+        return Err(Error::field(name, "fps", format!("{fps}"), "0.01 to 10000 frames a second"));
+    }
+    let metadata = std::fs::metadata(path).map_err(|e| match e.kind() {
+        std::io::ErrorKind::NotFound => {
+            Error::input(name, "no such file or folder", "a video file or a folder of images")
+        }
+        _ => Error::io(path, e),
+    })?;
+    if metadata.is_dir() {
+        Ok(Box::new(folder::Folder::open(path, name, fps.unwrap_or(DEFAULT_FOLDER_FPS))?))
+    } else {
+        Ok(Box::new(video::VideoFile::open(path, name)?))
+    }
+}
+
+/// FFmpeg is set up once; its own messages stay off the screen, since ours say more.
+fn init_ffmpeg() {
+    static ONCE: Once = Once::new();
+    ONCE.call_once(|| {
+        // Fails only where FFmpeg was built without its registry, which opening then reports.
+        let _ = ffmpeg_the_third::init();
+        ffmpeg_the_third::log::set_level(ffmpeg_the_third::log::Level::Quiet);
+    });
 }
 
 /// How an encoded frame is packed.

@@ -1,29 +1,23 @@
-//! The binary `stria`.
+//! Stria: laser-line video in, measured 3D walls out. One binary, `stria`: the service and the command line.
+//!
+//! Who may know whom: `http/*` and `worker` never import each other; they meet in the records (`runs`, `db`), the
+//! `queue` and the `store`. Only the `process` command runs the pipeline; workers start it as a child process.
 
-use clap::{Parser, Subcommand};
+pub mod cli;
+pub mod config;
+pub mod db;
+pub mod error;
+pub mod http;
+pub mod incoming;
+pub mod queue;
+pub mod retention;
+pub mod runs;
+pub mod store;
+pub mod wire;
+pub mod worker;
 
-#[path = "cli/simulate.rs"]
-mod simulate;
+use std::process::ExitCode;
 
-#[derive(Parser)]
-#[command(name = "stria")]
-struct Cli {
-    #[command(subcommand)]
-    command: Command,
-}
-
-#[derive(Subcommand)]
-enum Command {
-    Simulate(simulate::SimulateArgs),
-}
-
-fn main() -> std::process::ExitCode {
-    let Command::Simulate(args) = Cli::parse().command;
-    match simulate::run(&args) {
-        Ok(()) => std::process::ExitCode::SUCCESS,
-        Err(error) => {
-            eprintln!("stria: {error}");
-            std::process::ExitCode::from(2)
-        }
-    }
+fn main() -> ExitCode {
+    cli::run()
 }

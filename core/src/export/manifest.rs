@@ -1,10 +1,19 @@
 //! `manifest.json`: what was made, from what, with what, how well.
 
 use std::collections::BTreeMap;
+use std::fs::{self, File};
+use std::io::Read;
+use std::path::Path;
 
 use serde::{Deserialize, Serialize};
+use sha2::{Digest, Sha256};
 
 use crate::depth_map::MapGeometry;
+use crate::error::{Error, Result};
+use crate::export::new_file;
+
+/// The manifest's own name in the product folder.
+pub const FILE_NAME: &str = "manifest.json";
 
 /// Version of the manifest's shape; grows when a field changes its meaning.
 pub const SCHEMA_VERSION: u32 = 1;
@@ -18,6 +27,14 @@ pub struct FileEntry {
     pub bytes: u64,
     /// SHA-256 in lower-case hex.
     pub sha256: String,
+}
+
+impl FileEntry {
+    /// Measures and hashes the file at `path`, to be listed as `name`.
+    pub fn of(path: &Path, name: impl Into<String>) -> Result<FileEntry> {
+        let bytes = fs::metadata(path).map_err(|e| Error::io(path, e))?.len();
+        Ok(FileEntry { name: name.into(), bytes, sha256: sha256_of_file(path)? })
+    }
 }
 
 /// How the 16-bit gray values of `depth.png` map to mm: z = min_mm + (value − 1)·(max_mm − min_mm)/65534; 0 = none.
@@ -115,4 +132,131 @@ pub struct Manifest {
     pub timings_s: BTreeMap<String, f64>,
     /// Every product.
     pub products: Vec<FileEntry>,
+}
+
+impl Manifest {
+    /// Writes `manifest.json` into the product folder: the last file of a job, since it says that the rest is there.
+    pub fn write(&self, folder: &Path) -> Result<()> {
+        let path = folder.join(FILE_NAME);
+        let mut text = serde_json::to_vec_pretty(self).map_err(|e| Error::internal("manifest", e))?;
+        text.push(b'\n');
+        new_file::write(&path, &text)
+    }
+
+    /// Reads the manifest of a product folder.
+    ///
+    /// # Errors
+    /// Where it is missing, is no manifest, or has another schema version.
+    pub fn load(folder: &Path) -> Result<Manifest> {
+        let path = folder.join(FILE_NAME);
+        let text = fs::read(&path).map_err(|e| Error::io(&path, e))?;
+        let subject = path.display().to_string();
+        let json: serde_json::Value = serde_json::from_slice(&text)
+            .map_err(|e| Error::input(subject.clone(), format!("no JSON ({e})"), "a manifest of stria"))?;
+        let version = &json["schema_version"];
+        if *version != SCHEMA_VERSION {
+            return Err(Error::field(subject, "schema_version", version.to_string(), SCHEMA_VERSION.to_string()));
+        }
+        serde_json::from_value(json).map_err(|e| Error::input(subject, e.to_string(), "a manifest of stria"))
+    }
+}
+
+/// SHA-256 of bytes, in lower-case hex.
+pub fn sha256_of_bytes(bytes: &[u8]) -> String {
+    hex(&Sha256::digest(bytes))
+}
+
+/// SHA-256 of a file of any size, in lower-case hex.
+pub fn sha256_of_file(path: &Path) -> Result<String> {
+    let mut file = File::open(path).map_err(|e| Error::io(path, e))?;
+    let mut digest = Sha256::new();
+    let mut buffer = vec![0; 1 << 20];
+    loop {
+        match file.read(&mut buffer).map_err(|e| Error::io(path, e))? {
+            0 => return Ok(hex(&digest.finalize())),
+            length => digest.update(&buffer[..length]),
+        }
+    }
+}
+
+fn hex(bytes: &[u8]) -> String {
+    bytes.iter().map(|b| format!("{b:02x}")).collect()
+}
+
+/// Measures and hashes every product in a folder and the folders inside it, in the order of their names
+/// (`tiles/depth/0/0_0.png`); not the manifest itself, nor hidden files.
+pub fn list_products(folder: &Path) -> Result<Vec<FileEntry>> {
+    let mut entries = Vec::new();
+    list_into(folder, "", &mut entries)?;
+    entries.sort_by(|a, b| a.name.cmp(&b.name));
+    Ok(entries)
+}
+
+fn list_into(folder: &Path, prefix: &str, entries: &mut Vec<FileEntry>) -> Result<()> {
+    for item in fs::read_dir(folder).map_err(|e| Error::io(folder, e))? {
+        let item = item.map_err(|e| Error::io(folder, e))?;
+        let name = format!("{prefix}{}", item.file_name().to_string_lossy());
+        if item.file_name().to_string_lossy().starts_with('.') || name == FILE_NAME {
+            continue;
+        }
+        let path = item.path();
+        if item.file_type().map_err(|e| Error::io(&path, e))?.is_dir() {
+            list_into(&path, &format!("{name}/"), entries)?;
+        } else {
+            entries.push(FileEntry::of(&path, name)?);
+        }
+    }
+    Ok(())
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    fn manifest(products: Vec<FileEntry>) -> Manifest {
+        Manifest {
+            schema_version: SCHEMA_VERSION,
+            software: "stria 0".into(),
+            source: Vec::new(),
+            rig: serde_json::json!({"name": "r"}),
+            rig_sha256: sha256_of_bytes(b"r"),
+            recipe: serde_json::Value::Null,
+            recipe_sha256: String::new(),
+            depth_map: Some(MapGeometry { x0_mm: 0.1, y0_mm: -2.0, mm_per_px: 0.5, width_px: 3, height_px: 4 }),
+            depth_png: None,
+            resolution: None,
+            quality: Quality::default(),
+            gaps: Vec::new(),
+            warnings: vec!["a \"quoted\" name".into()],
+            timings_s: BTreeMap::from([("stripe".into(), 1.5)]),
+            products,
+        }
+    }
+
+    #[test]
+    fn products_are_listed_hashed_and_read_back() {
+        let folder = tempfile::tempdir().expect("temporary folder");
+        fs::create_dir_all(folder.path().join("tiles/depth")).expect("folders");
+        for (name, text) in [("b.txt", "abc"), ("tiles/depth/a", ""), ("manifest.json", "old"), (".unfinished-x", "")] {
+            fs::write(folder.path().join(name), text).expect("write");
+        }
+        let products = list_products(folder.path()).expect("list");
+        assert_eq!(
+            products.iter().map(|p| (p.name.as_str(), p.bytes)).collect::<Vec<_>>(),
+            [("b.txt", 3), ("tiles/depth/a", 0)]
+        );
+        // The first test vector of FIPS 180-2.
+        assert_eq!(products[0].sha256, "ba7816bf8f01cfea414140de5dae2223b00361a396177a9cb410ff61f20015ad");
+        let manifest = manifest(products);
+        manifest.write(folder.path()).expect("write");
+        assert_eq!(Manifest::load(folder.path()).expect("load"), manifest);
+    }
+
+    #[test]
+    fn another_version_is_refused_by_name() {
+        let folder = tempfile::tempdir().expect("temporary folder");
+        fs::write(folder.path().join(FILE_NAME), r#"{"schema_version": 99}"#).expect("write");
+        let message = Manifest::load(folder.path()).expect_err("another version").to_string();
+        assert!(message.contains("schema_version is 99; expected 1"), "{message}");
+    }
 }

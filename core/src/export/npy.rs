@@ -1,18 +1,16 @@
 //! NumPy `.npy` files (format version 1.0): a two-dimensional array, written row by row.
 
-use std::fs::File;
-use std::io::{BufWriter, Seek, SeekFrom, Write};
-use std::path::{Path, PathBuf};
+use std::path::Path;
 
 use crate::error::{Error, Result};
+use crate::export::new_file::{self, NewFile};
 
 /// Fixed size of magic, version, length and header: the row count is patched in at the end.
 const HEADER_BYTES: usize = 128;
 
 /// Writes a float32 array `[rows, columns]` of which the number of rows is known only at the end.
 pub struct NpyWriter {
-    path: PathBuf,
-    file: BufWriter<File>,
+    file: NewFile,
     columns: usize,
     rows: usize,
 }
@@ -20,31 +18,25 @@ pub struct NpyWriter {
 impl NpyWriter {
     /// Starts the file.
     pub fn create(path: &Path, columns: usize) -> Result<NpyWriter> {
-        let file = File::create(path).map_err(|e| Error::io(path, e))?;
-        let mut writer = NpyWriter { path: path.to_path_buf(), file: BufWriter::new(file), columns, rows: 0 };
-        writer.write(&header("<f4", 0, columns))?;
-        Ok(writer)
+        let mut file = NewFile::create(path)?;
+        file.put(&header("<f4", 0, columns))?;
+        Ok(NpyWriter { file, columns, rows: 0 })
     }
 
     /// Appends one row of `columns` values.
     pub fn push_row(&mut self, row: &[f32]) -> Result<()> {
         assert_eq!(row.len(), self.columns, "a row of another length");
         let bytes: Vec<u8> = row.iter().flat_map(|v| v.to_le_bytes()).collect();
-        self.write(&bytes)?;
+        self.file.put(&bytes)?;
         self.rows += 1;
         Ok(())
     }
 
-    /// Writes the number of rows into the header.
+    /// Writes the number of rows into the header and gives the file its name.
     pub fn finish(mut self) -> Result<()> {
-        let header = header("<f4", self.rows, self.columns);
-        self.file.seek(SeekFrom::Start(0)).map_err(|e| Error::io(&self.path, e))?;
-        self.write(&header)?;
-        self.file.flush().map_err(|e| Error::io(&self.path, e))
-    }
-
-    fn write(&mut self, bytes: &[u8]) -> Result<()> {
-        self.file.write_all(bytes).map_err(|e| Error::io(&self.path, e))
+        self.file.go_to(0)?;
+        self.file.put(&header("<f4", self.rows, self.columns))?;
+        self.file.commit()
     }
 }
 
@@ -53,7 +45,7 @@ pub fn write_bool(path: &Path, columns: usize, values: &[bool]) -> Result<()> {
     assert_eq!(values.len() % columns.max(1), 0, "whole rows");
     let mut bytes = header("|b1", values.len() / columns.max(1), columns);
     bytes.extend(values.iter().map(|v| u8::from(*v)));
-    std::fs::write(path, bytes).map_err(|e| Error::io(path, e))
+    new_file::write(path, &bytes)
 }
 
 fn header(descr: &str, rows: usize, columns: usize) -> Vec<u8> {

@@ -173,7 +173,15 @@ mod tests {
     }
 
     fn format(matrix: Matrix, full_range: bool) -> YuvFormat {
-        YuvFormat { width_px: 8, height_px: 4, chroma_shift_x: 1, chroma_shift_y: 1, chroma_left: true, matrix, full_range }
+        YuvFormat {
+            width_px: 8,
+            height_px: 4,
+            chroma_shift_x: 1,
+            chroma_shift_y: 1,
+            chroma_left: true,
+            matrix,
+            full_range,
+        }
     }
 
     #[test]

@@ -9,13 +9,14 @@ use ffmpeg::software::scaling;
 use ffmpeg::util::{chroma, color};
 
 use super::image::{Image, Matrix, PlaneView, YuvFormat, image_from_yuv};
+use super::{Frame, Source, SourceInfo};
 use crate::error::{Error, Result};
 use crate::rig::MAX_IMAGE_SIDE_PX;
 
 /// Containers that hold their own data. Play lists and other formats that name further files or
 /// addresses stay out: a hostile upload must not make the decoder open anything else.
 const CONTAINERS: &str = "mov,mp4,m4a,3gp,3g2,mj2,matroska,webm,avi,mpegts,mpeg,mpegvideo,h264,hevc,m4v,ivf,obu,flv,asf,\
-ogg,nut,mjpeg,mpjpeg,y4m,yuv4mpegpipe,jpeg_pipe,png_pipe,webp_pipe,tiff_pipe,bmp_pipe,pgm_pipe,ppm_pipe,gif,apng";
+ogg,nut,mjpeg,mpjpeg,y4m,yuv4mpegpipe,image2,jpeg_pipe,png_pipe,webp_pipe,tiff_pipe,bmp_pipe,pgm_pipe,ppm_pipe,gif,apng";
 
 /// Undecodable packets in a row after which the rest of the file is given up.
 const MAX_BAD_PACKETS_IN_A_ROW: u32 = 300;
@@ -35,7 +36,6 @@ pub(super) struct Video {
     stream: usize,
     time_base_s: f64,
     decoder: ffmpeg::decoder::Video,
-    converter: Option<scaling::Context>,
     bad_packets: u64,
     bad_in_a_row: u32,
     read_error: Option<String>,
@@ -60,16 +60,24 @@ pub(super) fn open_container(path: &Path, name: &str) -> Result<ffmpeg::format::
     let mut options = ffmpeg::Dictionary::new();
     options.set("protocol_whitelist", "file");
     options.set("format_whitelist", CONTAINERS);
+    // An image's name is a name, not a pattern that could match other files.
+    options.set("pattern_type", "none");
     // FFmpeg reads names with a colon as an address: always hand it a file's path.
     let mut url = std::ffi::OsString::from("file:");
     url.push(path.as_os_str());
     ffmpeg::format::input_with_dictionary(url, options).map_err(|e| {
         let hint = match head_kind(path) {
-            Head::Mp4WithoutIndex => "; its index (moov) is missing: the recording was cut off before the camera wrote it",
+            Head::Mp4WithoutIndex => {
+                "; its index (moov) is missing: the recording was cut off before the camera wrote it"
+            }
             Head::Text => "; it looks like text",
             Head::Other => "",
         };
-        Error::input(name, format!("not readable as video or image ({e}{hint})"), "a video file that FFmpeg reads (MP4, MKV, AVI, MPEG-TS, …) or an image")
+        Error::input(
+            name,
+            format!("not readable as video or image ({e}{hint})"),
+            "a video file that FFmpeg reads (MP4, MKV, AVI, MPEG-TS, …) or an image",
+        )
     })
 }
 
@@ -95,7 +103,7 @@ fn head_kind(path: &Path) -> Head {
 
 impl Video {
     /// Opens a file; `name` names it in errors.
-    pub fn open(path: &Path, name: &str) -> Result<Video> {
+    pub(super) fn open(path: &Path, name: &str) -> Result<Video> {
         let input = open_container(path, name)?;
         let no_video = || Error::input(name, "no video stream", "a file with a video stream");
         let stream = input.streams().best(ffmpeg::media::Type::Video).ok_or_else(no_video)?;
@@ -105,10 +113,9 @@ impl Video {
         let mut context = ffmpeg::codec::context::Context::from_parameters(parameters)
             .map_err(|e| Error::input(name, format!("an unusable video stream ({e})"), "a stream FFmpeg decodes"))?;
         context.set_threading(ffmpeg::threading::Config::kind(ffmpeg::threading::Type::Frame));
-        let decoder = context
-            .decoder()
-            .video()
-            .map_err(|e| Error::input(name, format!("a video stream without decoder ({e})"), "a stream FFmpeg decodes"))?;
+        let decoder = context.decoder().video().map_err(|e| {
+            Error::input(name, format!("a video stream without decoder ({e})"), "a stream FFmpeg decodes")
+        })?;
         let base = stream.time_base();
         let rate = stream.avg_frame_rate();
         let frames_per_s = (rate.1 > 0 && rate.0 > 0).then(|| f64::from(rate.0) / f64::from(rate.1));
@@ -121,7 +128,6 @@ impl Video {
             width_px,
             height_px,
             decoder,
-            converter: None,
             bad_packets: 0,
             bad_in_a_row: 0,
             read_error: None,
@@ -131,7 +137,7 @@ impl Video {
     }
 
     /// The next picture; `None` at the end of what can be read.
-    pub fn next_picture(&mut self) -> Result<Option<Picture>> {
+    pub(super) fn next_picture(&mut self) -> Result<Option<Picture>> {
         let mut decoded = ffmpeg::frame::Video::empty();
         loop {
             match self.decoder.receive_frame(&mut decoded) {
@@ -139,18 +145,18 @@ impl Video {
                     self.bad_in_a_row = 0;
                     check_size(&self.name, decoded.width(), decoded.height())?;
                     let time_s = decoded.timestamp().or(decoded.pts()).map(|t| t as f64 * self.time_base_s);
-                    return Ok(Some(Picture { time_s, image: self.image(&decoded)? }));
+                    return Ok(Some(Picture { time_s, image: image(&decoded)? }));
                 }
                 Err(ffmpeg::Error::Eof) => return Ok(None),
                 // The decoder wants more; anything else is a broken picture that is counted where it was sent.
                 Err(_) if self.at_end => return Ok(None),
-                Err(_) => self.feed()?,
+                Err(_) => self.feed(),
             }
         }
     }
 
     /// What went wrong on the way, in words for people.
-    pub fn warnings(&self) -> Vec<String> {
+    fn warnings(&self) -> Vec<String> {
         let mut warnings = Vec::new();
         if let Some(error) = &self.read_error {
             warnings.push(format!("{}: reading stopped early ({error}); what was read is processed", self.name));
@@ -162,86 +168,132 @@ impl Video {
     }
 
     /// Reads one packet of our stream into the decoder, or tells it that the file has ended.
-    fn feed(&mut self) -> Result<()> {
+    fn feed(&mut self) {
         let mut packet = ffmpeg::Packet::empty();
         loop {
             match packet.read(&mut self.input) {
                 Ok(()) if packet.stream() == self.stream => break,
-                Ok(()) => continue,
-                Err(e) => {
-                    if e != ffmpeg::Error::Eof {
-                        self.read_error = Some(e.to_string());
-                    }
-                    self.at_end = true;
-                    // Fails only when it was told so before.
-                    let _ = self.decoder.send_eof();
-                    self.at_end = false;
-                    return self.drain_mark();
-                }
+                Ok(()) => {}
+                Err(ffmpeg::Error::Eof) => return self.end(None),
+                Err(e) => return self.end(Some(e.to_string())),
             }
         }
         if packet.is_corrupt() || self.decoder.send_packet(&packet).is_err() {
             self.bad_packets += 1;
             self.bad_in_a_row += 1;
             if self.bad_in_a_row > MAX_BAD_PACKETS_IN_A_ROW {
-                self.read_error = Some(format!("{MAX_BAD_PACKETS_IN_A_ROW} damaged packets in a row"));
-                let _ = self.decoder.send_eof();
-                return self.drain_mark();
+                self.end(Some(format!("{MAX_BAD_PACKETS_IN_A_ROW} damaged packets in a row")));
             }
         }
-        Ok(())
     }
 
-    fn drain_mark(&mut self) -> Result<()> {
+    fn end(&mut self, read_error: Option<String>) {
         self.at_end = true;
-        Ok(())
+        self.read_error = read_error;
+        // Fails only when the decoder was told so before, which `at_end` rules out.
+        let _ = self.decoder.send_eof();
     }
+}
 
-    fn image(&mut self, frame: &ffmpeg::frame::Video) -> Result<Image> {
-        let (width, height) = (frame.width() as usize, frame.height() as usize);
-        if let Some((chroma_shift_x, chroma_shift_y)) = planar_shifts(frame.format()) {
-            let format = YuvFormat {
-                width_px: width,
-                height_px: height,
-                chroma_shift_x,
-                chroma_shift_y,
-                chroma_left: chroma_left(frame),
-                matrix: matrix(frame),
-                full_range: full_range(frame),
-            };
-            let plane = |i| PlaneView { data: frame.data(i), stride_bytes: frame.stride(i) };
-            return Ok(image_from_yuv(&format, plane(0), plane(1), plane(2)));
-        }
-        let target = if is_rgb(frame.format()) { Pixel::BGR24 } else { Pixel::YUV444P };
-        let mut converted = self.convert(frame, target)?;
-        if target == Pixel::YUV444P {
-            converted.set_color_space(frame.color_space());
-            converted.set_color_range(frame.color_range());
-            return self.image(&converted);
-        }
-        let stride = converted.stride(0);
-        let bgr = (0..height).flat_map(|r| &converted.data(0)[r * stride..][..3 * width]).copied().collect();
-        Ok(Image::from_bgr(width as u32, height as u32, bgr))
-    }
-
-    fn convert(&mut self, frame: &ffmpeg::frame::Video, target: Pixel) -> Result<ffmpeg::frame::Video> {
-        let failed = |e: ffmpeg::Error| Error::internal("colour conversion", e);
-        let (width, height) = (frame.width(), frame.height());
-        let fits = |c: &scaling::Context| {
-            let (i, o) = (c.input(), c.output());
-            i.format == frame.format() && i.width == width && i.height == height && o.format == target
+/// The colours of a decoded frame.
+fn image(frame: &ffmpeg::frame::Video) -> Result<Image> {
+    let (width, height) = (frame.width() as usize, frame.height() as usize);
+    if let Some((chroma_shift_x, chroma_shift_y)) = planar_shifts(frame.format()) {
+        let format = YuvFormat {
+            width_px: width,
+            height_px: height,
+            chroma_shift_x,
+            chroma_shift_y,
+            chroma_left: chroma_left(frame),
+            matrix: matrix(frame),
+            full_range: full_range(frame),
         };
-        if !self.converter.as_ref().is_some_and(fits) {
-            let flags = scaling::Flags::BILINEAR | scaling::Flags::ACCURATE_RND | scaling::Flags::FULL_CHR_H_INT;
-            self.converter =
-                Some(scaling::Context::get(frame.format(), width, height, target, width, height, flags).map_err(failed)?);
+        let plane = |i| PlaneView { data: frame.data(i), stride_bytes: frame.stride(i) };
+        return Ok(image_from_yuv(&format, plane(0), plane(1), plane(2)));
+    }
+    let target = if is_rgb(frame.format()) { Pixel::BGR24 } else { Pixel::YUV444P };
+    let mut converted = convert(frame, target)?;
+    if target == Pixel::YUV444P {
+        converted.set_color_space(frame.color_space());
+        converted.set_color_range(frame.color_range());
+        return image(&converted);
+    }
+    let stride = converted.stride(0);
+    let bgr = (0..height).flat_map(|r| &converted.data(0)[r * stride..][..3 * width]).copied().collect();
+    Ok(Image::from_bgr(width as u32, height as u32, bgr))
+}
+
+/// Converts an unusual pixel format without touching its colour matrix. The converter is made anew for
+/// each frame, since it may not move between threads; the formats that cameras send never come here.
+fn convert(frame: &ffmpeg::frame::Video, target: Pixel) -> Result<ffmpeg::frame::Video> {
+    let failed = |e: ffmpeg::Error| Error::internal("colour conversion", e);
+    let (width, height) = (frame.width(), frame.height());
+    let flags = scaling::Flags::BILINEAR | scaling::Flags::ACCURATE_RND | scaling::Flags::FULL_CHR_H_INT;
+    let mut converter =
+        scaling::Context::get(frame.format(), width, height, target, width, height, flags).map_err(failed)?;
+    let mut converted = ffmpeg::frame::Video::empty();
+    converter.run(frame, &mut converted).map_err(failed)?;
+    Ok(converted)
+}
+
+/// A video file as the frames of a run.
+pub(super) struct VideoFile {
+    info: SourceInfo,
+    video: Video,
+    first_time_s: Option<f64>,
+    last_time_s: f64,
+    next: u32,
+    ended: bool,
+}
+
+impl VideoFile {
+    pub(super) fn open(path: &Path, name: &str) -> Result<VideoFile> {
+        let video = Video::open(path, name)?;
+        let info = SourceInfo {
+            width_px: video.width_px,
+            height_px: video.height_px,
+            frames_announced: video.frames_announced,
+            frames_per_s: video.frames_per_s,
+            files: vec![path.to_path_buf()],
+        };
+        Ok(VideoFile { info, video, first_time_s: None, last_time_s: 0.0, next: 0, ended: false })
+    }
+
+    /// Capture time since the first frame: the file's own time stamp, or the frame rate where it has none.
+    fn time_s(&mut self, stamp_s: Option<f64>) -> f64 {
+        let counted_s = f64::from(self.next) / self.info.frames_per_s.unwrap_or(super::DEFAULT_FOLDER_FPS);
+        let stamp_s = stamp_s.unwrap_or(counted_s);
+        let since_first_s = stamp_s - *self.first_time_s.get_or_insert(stamp_s);
+        self.last_time_s = since_first_s.max(self.last_time_s);
+        self.last_time_s
+    }
+}
+
+impl Source for VideoFile {
+    fn info(&self) -> &SourceInfo {
+        &self.info
+    }
+
+    fn next_frame(&mut self) -> Result<Option<Frame>> {
+        let Some(picture) = self.video.next_picture()? else {
+            self.ended = true;
+            return Ok(None);
+        };
+        let frame = Frame { index: self.next, time_s: self.time_s(picture.time_s), image: picture.image };
+        self.next += 1;
+        Ok(Some(frame))
+    }
+
+    fn warnings(&self) -> Vec<String> {
+        let mut warnings = self.video.warnings();
+        match self.info.frames_announced {
+            Some(announced) if self.ended && u64::from(self.next) < announced => warnings.push(format!(
+                "{}: the file announces {announced} frames but holds {}; it was cut off or damaged, what is there was processed",
+                self.video.name, self.next
+            )),
+            _ => {}
         }
-        let mut converted = ffmpeg::frame::Video::empty();
-        match &mut self.converter {
-            Some(converter) => converter.run(frame, &mut converted).map_err(failed)?,
-            None => unreachable!("set above"),
-        }
-        Ok(converted)
+        warnings
     }
 }
 
@@ -250,7 +302,11 @@ fn check_size(name: &str, width_px: u32, height_px: u32) -> Result<()> {
     if fits(width_px) && fits(height_px) {
         return Ok(());
     }
-    Err(Error::field(name, "image size", format!("{width_px}x{height_px} px"), format!("16 to {MAX_IMAGE_SIDE_PX} px a side")))
+    let found = match (width_px, height_px) {
+        (0, 0) => "unknown: 0x0 px, or more than the decoder takes".to_string(),
+        _ => format!("{width_px}x{height_px} px"),
+    };
+    Err(Error::field(name, "image size", found, format!("16 to {MAX_IMAGE_SIDE_PX} px a side")))
 }
 
 fn planar_shifts(format: Pixel) -> Option<(u32, u32)> {
@@ -266,7 +322,9 @@ fn planar_shifts(format: Pixel) -> Option<(u32, u32)> {
 fn is_rgb(format: Pixel) -> bool {
     let Some(descriptor) = format.descriptor() else { return false };
     let name = descriptor.name();
-    ["rgb", "bgr", "gbr", "pal8", "gray", "mono", "argb", "abgr", "ya8", "0rgb", "0bgr"].iter().any(|p| name.starts_with(p))
+    ["rgb", "bgr", "gbr", "pal8", "gray", "mono", "argb", "abgr", "ya8", "0rgb", "0bgr"]
+        .iter()
+        .any(|p| name.starts_with(p))
 }
 
 fn is_jpeg_range(format: Pixel) -> bool {

@@ -13,7 +13,7 @@ use stria_core::{Error, Result};
 /// Makes a run with known truth: a video, its rig, its truth
 #[derive(Args, Debug)]
 #[command(after_help = scene_list())]
-pub(crate) struct SimulateArgs {
+pub(super) struct SimulateArgs {
     /// What to show; the list is below
     scene: String,
     /// The folder to write: new or empty
@@ -87,7 +87,7 @@ fn scene_list() -> String {
 ///
 /// # Errors
 /// Unknown scenes, sizes, lengths and rates out of range, a folder that is not empty or cannot be written.
-pub(crate) fn run(args: &SimulateArgs) -> Result<()> {
+pub(super) fn run(args: &SimulateArgs) -> Result<()> {
     let simulation = Simulation::new(scene(args)?, parse_size(&args.size)?, args.fps, args.seconds, args.seed)?;
     let output = match (args.frames, args.exact) {
         (true, _) => Output::Images,

@@ -1,0 +1,132 @@
+//! `preview.png`: the depth map for people: coloured by depth, shaded as if lit from the upper left, with
+//! axes, legend and scale bar; at most 2,000 px wide.
+//!
+//! The colours span the middle 98 % of the depths, so that a few stray points do not flatten the rest. Long
+//! maps are wrapped into strips, read like lines of text.
+
+mod canvas;
+mod colour;
+mod furniture;
+mod layout;
+mod reduce;
+mod relief;
+
+use std::path::Path;
+
+use png::{BitDepth, ColorType, Compression, Encoder};
+
+use crate::depth_map::MapReader;
+use crate::error::{Error, Result};
+use crate::export::new_file::NewFile;
+
+use canvas::Canvas;
+use layout::{Layout, WIDTH_PX};
+use reduce::Reduced;
+
+/// Share of the depths beyond each end of the colours.
+const TAIL: f64 = 0.01;
+/// Least span of the colours, mm: a flat plate must not become a picture of noise.
+const LEAST_SPAN_MM: f64 = 0.2;
+
+/// What the picture says beside the map.
+#[derive(Clone, Debug, Default, PartialEq)]
+pub struct PreviewText {
+    /// The first line; empty: *Depth map*.
+    pub title: String,
+    /// Chainage of the world's x = 0, mm.
+    pub start_chainage_mm: f64,
+    /// The chainage falls along world x.
+    pub chainage_falls: bool,
+}
+
+impl PreviewText {
+    fn chainage_mm(&self, x_mm: f64) -> f64 {
+        self.start_chainage_mm + if self.chainage_falls { -x_mm } else { x_mm }
+    }
+}
+
+/// Depths at the ends of the colours, mm.
+#[derive(Clone, Copy)]
+struct Range {
+    near_mm: f64,
+    far_mm: f64,
+}
+
+/// Writes the picture to `path`.
+///
+/// # Errors
+/// An empty map; what the reading of the map or the disk says.
+pub fn write(map: &mut dyn MapReader, path: &Path, text: &PreviewText) -> Result<()> {
+    save(&paint(map, text)?, path)
+}
+
+/// The picture in memory: width and height, px, and red, green, blue of each pixel.
+///
+/// # Errors
+/// An empty map; what the reading of the map says.
+pub fn picture(map: &mut dyn MapReader, text: &PreviewText) -> Result<(usize, usize, Vec<u8>)> {
+    let canvas = paint(map, text)?;
+    Ok((canvas.width_px, canvas.height_px, canvas.rgb().to_vec()))
+}
+
+fn paint(map: &mut dyn MapReader, text: &PreviewText) -> Result<Canvas> {
+    let geometry = map.geometry();
+    if geometry.width_px == 0 || geometry.height_px == 0 {
+        return Err(Error::internal("preview.png", "an empty map"));
+    }
+    let layout = Layout::of(&geometry);
+    let factor = (layout.mm_per_px / geometry.mm_per_px).round().max(1.0) as usize;
+    let reduced = Reduced::read(map, factor)?;
+    let range = colour_range(&reduced);
+    let mut canvas = Canvas::new(WIDTH_PX, layout.height_px(), [255; 3])?;
+    draw_map(&mut canvas, &layout, &reduced, range);
+    furniture::draw(&mut canvas, &furniture::Sheet { layout, geometry, text, range, coverage: reduced.coverage });
+    Ok(canvas)
+}
+
+fn colour_range(map: &Reduced) -> Option<Range> {
+    let (near_mm, far_mm) = map.range_mm(TAIL)?;
+    let widen_mm = ((LEAST_SPAN_MM - (far_mm - near_mm)) / 2.0).max(0.0);
+    Some(Range { near_mm: near_mm - widen_mm, far_mm: far_mm + widen_mm })
+}
+
+fn draw_map(canvas: &mut Canvas, layout: &Layout, map: &Reduced, range: Option<Range>) {
+    let range = range.unwrap_or(Range { near_mm: 0.0, far_mm: 1.0 });
+    let shades = relief::shade(map);
+    let scale = layout.mm_per_px / map.mm_per_px;
+    for strip in 0..layout.strips {
+        let (left, top) = (layout.strip_left_px() as i64, layout.strip_top_px(strip) as i64);
+        for row in 0..layout.strip_height_px {
+            for column in 0..layout.strip_width_px {
+                // Centres of pixels are at whole numbers in the map, at halves in the ratio of sizes.
+                let x = ((strip * layout.strip_width_px + column) as f64 + 0.5) * scale - 0.5;
+                let y = (row as f64 + 0.5) * scale - 0.5;
+                let (at_x, at_y) = (left + column as i64, top + row as i64);
+                let z_mm = Reduced::at(&map.depth_mm, map.width_px, map.height_px, x, y);
+                if z_mm.is_nan() {
+                    canvas.hatch(at_x, at_y);
+                    continue;
+                }
+                let share = (f64::from(z_mm) - range.near_mm) / (range.far_mm - range.near_mm);
+                let shade = Reduced::at(&shades, map.width_px, map.height_px, x, y);
+                canvas.blend(at_x, at_y, colour::shaded(colour::ramp(share), shade), 1.0);
+            }
+        }
+    }
+}
+
+fn save(canvas: &Canvas, path: &Path) -> Result<()> {
+    let refused = |e: png::EncodingError| Error::io(path, e.into());
+    let mut file = NewFile::create(path)?;
+    let mut encoder = Encoder::new(&mut file, canvas.width_px as u32, canvas.height_px as u32);
+    encoder.set_color(ColorType::Rgb);
+    encoder.set_depth(BitDepth::Eight);
+    encoder.set_compression(Compression::Balanced);
+    let mut writer = encoder.write_header().map_err(refused)?;
+    writer.write_image_data(canvas.rgb()).map_err(refused)?;
+    writer.finish().map_err(refused)?;
+    file.commit()
+}
+
+#[cfg(test)]
+mod tests;

@@ -1,0 +1,394 @@
+//! The products of a job: what is written while the frames go by, and what is written at the end.
+
+use std::path::Path;
+
+use super::progress::Progress;
+use super::quality::QualityCounter;
+use super::{Cargo, Event, ProductGroup, Request, Timings};
+use crate::depth_map::strips::{add_strip, strip_grid};
+use crate::depth_map::{FinishedMap, MapReader, SurfaceMap};
+use crate::error::{Error, Result};
+use crate::export::archive_mcap::ArchiveWriter;
+use crate::export::cloud_ply::CloudPlyWriter;
+use crate::export::manifest::{
+    FileEntry, Gap, GrayScale, Manifest, Quality, SCHEMA_VERSION, list_products, sha256_of_bytes,
+};
+use crate::export::npy::NpyWriter;
+use crate::export::preview::{self, PreviewText};
+use crate::export::tiles::{TileGrid, TileWriter};
+use crate::export::trajectory_csv::{TrajectoryRow, TrajectoryWriter};
+use crate::export::{depth_png, depth_tif, texture};
+use crate::recording::{FrameSteps, RecordedRun, Recorder, Segment};
+use crate::rig::{LineDirection, Rig};
+use crate::source::{SourceInfo, encoded_frames};
+use crate::stripe::Stripe;
+use crate::surface::{Placed, SurfacePoint};
+
+/// Where live recording segments lie in the product folder; they are no products.
+const SEGMENTS: &str = "recording";
+
+/// All writers of a job.
+pub(super) struct Products<'a> {
+    request: &'a Request,
+    map: Option<SurfaceMap>,
+    tiles: Option<TileWriter>,
+    trajectory: Option<TrajectoryWriter>,
+    cloud: Option<CloudPlyWriter>,
+    stripes: Option<NpyWriter>,
+    recorder: Option<Recorder>,
+    archive: Option<ArchiveWriter>,
+    frames: u64,
+}
+
+impl<'a> Products<'a> {
+    /// Starts the files that grow with the frames.
+    pub(super) fn create(request: &'a Request, info: &SourceInfo) -> Result<Products<'a>> {
+        let (folder, rig, recipe) = (&request.out_dir, &request.rig, &request.recipe);
+        let wanted = |group| request.products.contains(&group);
+        let line_positions = match rig.laser.line {
+            LineDirection::Vertical => rig.camera.height_px,
+            LineDirection::Horizontal => rig.camera.width_px,
+        };
+        let run = RecordedRun {
+            name: &request.source_name,
+            recorded_at: request.recorded_at,
+            frames_expected: info.frames_announced,
+            duration_expected_s: info.frames_announced.zip(info.frames_per_s).map(|(n, fps)| n as f64 / fps),
+        };
+        let segments = request.live_segments.then(|| folder.join(SEGMENTS));
+        let recorder =
+            || Recorder::create(&recipe.recording, rig, &run, &folder.join("recording.rrd"), segments.as_deref());
+        let archive = || {
+            ArchiveWriter::create(&folder.join("archive.mcap"), rig, recipe, &request.source_name, request.recorded_at)
+        };
+        Ok(Products {
+            request,
+            map: None,
+            tiles: None,
+            trajectory: make(wanted(ProductGroup::Trajectory), || {
+                TrajectoryWriter::create(&folder.join("trajectory.csv"))
+            })?,
+            cloud: make(wanted(ProductGroup::Cloud), || CloudPlyWriter::create(&folder.join("cloud.ply")))?,
+            stripes: make(recipe.stripe.keep, || {
+                NpyWriter::create(&folder.join("stripes.npy"), line_positions as usize)
+            })?,
+            recorder: make(wanted(ProductGroup::Recording), recorder)?,
+            archive: make(wanted(ProductGroup::Archive), archive)?,
+            frames: 0,
+        })
+    }
+
+    /// Whether the recording shows the picture of a frame at this time.
+    pub(super) fn wants_picture(&self, time_s: f64) -> bool {
+        self.recorder.as_ref().is_some_and(|recorder| recorder.wants_image(time_s))
+    }
+
+    /// Keeps a stripe, in the order of the frames.
+    pub(super) fn stripe(&mut self, stripe: &Stripe) -> Result<()> {
+        self.stripes.as_mut().map_or(Ok(()), |file| file.push_row(&stripe.across_px))
+    }
+
+    /// Adds a placed frame to everything that grows.
+    pub(super) fn add(&mut self, placed: &Placed<Cargo>, progress: &mut Progress<'_, '_>) -> Result<()> {
+        let (measured, cargo) = (&placed.measured, &placed.measured.cargo);
+        self.frames += 1;
+        let points = surface_points(placed);
+        let line = self.request.rig.laser.line;
+        if let Some(map) = self.map_for(placed)? {
+            add_strip(map, line, placed, cargo.texture.as_ref())?;
+        }
+        if let Some(trajectory) = &mut self.trajectory {
+            trajectory.push(&trajectory_row(placed))?;
+        }
+        if let Some(cloud) = &mut self.cloud {
+            points.iter().try_for_each(|point| cloud.push(point))?;
+        }
+        if let Some(archive) = &mut self.archive {
+            archive.pose(measured.time_s, &placed.world_from_camera)?;
+            archive.profile(measured.time_s, &measured.profile, &points)?;
+            archive.surface(measured.time_s, &points)?;
+            archive.measurement(measured.frame, measured.time_s, &cargo.stripe, &measured.shift)?;
+        }
+        if let Some(recorder) = &mut self.recorder {
+            let picture = cargo.picture.as_ref();
+            let segments = recorder.log_frame(&FrameSteps {
+                frame_index: measured.frame,
+                time_s: measured.time_s,
+                image: picture.map(|p| &p.image),
+                effective_area: picture.map(|p| p.effective_area.as_slice()),
+                row_threshold: picture.map(|p| p.row_threshold.as_slice()),
+                stripe: &cargo.stripe,
+                shift: &measured.shift,
+                world_from_camera: Some(placed.world_from_camera),
+                points: &points,
+            })?;
+            self.announce(segments, progress)?;
+        }
+        self.write_changed_tiles()
+    }
+
+    /// The map, which begins with the first frame that has points: their distance gives the pixel's size.
+    fn map_for(&mut self, placed: &Placed<Cargo>) -> Result<Option<&mut SurfaceMap>> {
+        let rig = &self.request.rig;
+        if let (None, Some(z_mm)) = (&self.map, placed.measured.profile.median_z_mm()) {
+            let line_x_mm = line_x_mm(rig, z_mm) + placed.world_from_camera.translation.x;
+            // Grid column 0 is where this frame's line lies.
+            let mut grid = strip_grid(rig, z_mm, line_x_mm);
+            grid.x_mm -= placed.travel_px.round() * grid.mm_per_px;
+            let folder = &self.request.out_dir;
+            self.map = Some(SurfaceMap::create(grid, self.request.recipe.map.tiles_in_memory as usize, folder)?);
+            if self.request.products.contains(&ProductGroup::Tiles) {
+                let grid = TileGrid { x0_mm: grid.x_mm, y0_mm: grid.y_mm, mm_per_px: grid.mm_per_px };
+                self.tiles = Some(TileWriter::create(folder, grid)?);
+            }
+        }
+        Ok(self.map.as_mut())
+    }
+
+    /// Hands tiles out while the run goes on, now and then, so that people can look.
+    fn write_changed_tiles(&mut self) -> Result<()> {
+        let (Some(map), Some(tiles)) = (&mut self.map, &mut self.tiles) else { return Ok(()) };
+        if self.frames % u64::from(self.request.recipe.map.tile_frames) != 0 {
+            return Ok(());
+        }
+        for index in map.take_changed() {
+            tiles.put(index.0, index.1, &map.tile_window(index)?)?;
+        }
+        Ok(())
+    }
+
+    fn announce(&self, segments: Vec<Segment>, progress: &mut Progress<'_, '_>) -> Result<()> {
+        for segment in segments {
+            let path = segment.path.strip_prefix(&self.request.out_dir).unwrap_or(&segment.path);
+            let path = path.to_string_lossy().into_owned();
+            progress.send(Event::Segment { number: segment.number, path, bytes: segment.bytes })?;
+        }
+        Ok(())
+    }
+
+    /// Writes what is written at the end, and the manifest last.
+    pub(super) fn finish(
+        mut self,
+        info: &SourceInfo,
+        quality: QualityCounter,
+        mut timings: Timings,
+        progress: &mut Progress<'_, '_>,
+    ) -> Result<Manifest> {
+        let request = self.request;
+        let mut map = self.map.take();
+        let mut finished = map.as_mut().and_then(SurfaceMap::finished);
+        let geometry = finished.as_ref().map(|map| map.geometry());
+        let coverage = finished.as_ref().map_or(0.0, FinishedMap::coverage);
+        let (quality, gaps, resolution) = quality.finish(&request.rig, coverage);
+        warn_of_quality(&quality, &gaps, request, progress)?;
+        let gray = timings.time("maps", || self.write_maps(finished.as_mut(), progress))?;
+        if let Some(trajectory) = self.trajectory.take() {
+            progress.step("trajectory")?;
+            trajectory.finish()?;
+        }
+        if let Some(cloud) = self.cloud.take() {
+            progress.step("cloud")?;
+            cloud.finish()?;
+        }
+        if let Some(stripes) = self.stripes.take() {
+            stripes.finish()?;
+        }
+        let rig_toml = request.rig.to_toml();
+        let recipe_toml = request.recipe.to_toml();
+        let mut manifest = Manifest {
+            schema_version: SCHEMA_VERSION,
+            software: format!("stria {}", env!("CARGO_PKG_VERSION")),
+            source: hash_source(info, &request.source_name)?,
+            rig: request.rig.to_json(),
+            rig_sha256: sha256_of_bytes(rig_toml.as_bytes()),
+            recipe: serde_json::to_value(&request.recipe).map_err(|e| Error::internal("manifest", e))?,
+            recipe_sha256: sha256_of_bytes(recipe_toml.as_bytes()),
+            depth_map: geometry,
+            depth_png: gray,
+            resolution,
+            quality,
+            gaps,
+            warnings: Vec::new(),
+            timings_s: std::collections::BTreeMap::new(),
+            products: Vec::new(),
+        };
+        let archived = timings.time("archive", || self.finish_archive(&manifest, finished.as_mut(), progress))?;
+        timings.time("recording", || self.finish_recording(finished.as_mut(), progress))?;
+        if let Some(warning) = archived {
+            progress.warn(warning)?;
+        }
+        progress.step("manifest")?;
+        manifest.warnings = progress.warnings().to_vec();
+        manifest.products = list_products(&request.out_dir)?;
+        manifest.products.retain(|product| !product.name.starts_with(&format!("{SEGMENTS}/")));
+        manifest.timings_s = timings.stages;
+        manifest.write(&request.out_dir)?;
+        Ok(manifest)
+    }
+
+    fn write_maps(
+        &mut self,
+        map: Option<&mut FinishedMap<'_>>,
+        progress: &mut Progress<'_, '_>,
+    ) -> Result<Option<GrayScale>> {
+        let Some(map) = map else { return Ok(None) };
+        let (folder, wanted) = (&self.request.out_dir, &self.request.products);
+        let mut gray = None;
+        if wanted.contains(&ProductGroup::Depth) {
+            progress.step("depth")?;
+            depth_tif::write(map, &folder.join("depth.tif"))?;
+            gray = depth_png::write(map, folder)?;
+        }
+        if wanted.contains(&ProductGroup::Texture) {
+            progress.step("texture")?;
+            texture::write(map, folder)?;
+        }
+        if wanted.contains(&ProductGroup::Preview) {
+            progress.step("preview")?;
+            preview::write(map, &folder.join("preview.png"), &self.preview_text())?;
+        }
+        if let Some(tiles) = self.tiles.take() {
+            progress.step("tiles")?;
+            tiles.finish(map)?;
+        }
+        Ok(gray)
+    }
+
+    fn preview_text(&self) -> PreviewText {
+        PreviewText { title: self.request.source_name.clone(), ..PreviewText::default() }
+    }
+
+    /// Completes the archive: the frames as they were given, the map, and what is attached. Returns what
+    /// could not be kept, in words.
+    fn finish_archive(
+        &mut self,
+        manifest: &Manifest,
+        map: Option<&mut FinishedMap<'_>>,
+        progress: &mut Progress<'_, '_>,
+    ) -> Result<Option<String>> {
+        let Some(mut archive) = self.archive.take() else { return Ok(None) };
+        let request = self.request;
+        progress.step("archive")?;
+        let mut lost = None;
+        match encoded_frames(&request.source, &request.source_name, request.fps) {
+            Ok(frames) => {
+                for frame in frames.take(self.frames as usize) {
+                    archive.frame(&frame?)?;
+                }
+            }
+            Err(Error::Input { found, .. }) => lost = Some(format!("the archive holds no camera frames: {found}")),
+            Err(error) => return Err(error),
+        }
+        if let Some(map) = map {
+            let geometry = map.geometry();
+            archive.depth_map(&geometry, |column, row, width, height| map.window(column, row, width, height))?;
+        }
+        for warning in progress.warnings() {
+            archive.warning(warning)?;
+        }
+        archive.attach("rig.toml", "application/toml", request.rig.to_toml().as_bytes())?;
+        archive.attach("recipe.toml", "application/toml", request.recipe.to_toml().as_bytes())?;
+        let json = serde_json::to_vec_pretty(manifest).map_err(|e| Error::internal("archive", e))?;
+        archive.attach("manifest.json", "application/json", &json)?;
+        let preview = request.out_dir.join("preview.png");
+        if preview.exists() {
+            let picture = std::fs::read(&preview).map_err(|e| Error::io(&preview, e))?;
+            archive.attach("preview.png", "image/png", &picture)?;
+        }
+        archive.finish()?;
+        Ok(lost)
+    }
+
+    fn finish_recording(&mut self, map: Option<&mut FinishedMap<'_>>, progress: &mut Progress<'_, '_>) -> Result<()> {
+        let Some(mut recorder) = self.recorder.take() else { return Ok(()) };
+        progress.step("recording")?;
+        if let Some(map) = map {
+            let (width_px, height_px, rgb) = preview::picture(map, &self.preview_text())?;
+            recorder.log_map(width_px as u32, height_px as u32, &rgb)?;
+        }
+        for warning in progress.warnings().to_vec() {
+            recorder.log_warning(&warning)?;
+        }
+        let segments = recorder.finish()?;
+        self.announce(segments, progress)
+    }
+}
+
+fn make<T>(wanted: bool, create: impl FnOnce() -> Result<T>) -> Result<Option<T>> {
+    if wanted { create().map(Some) } else { Ok(None) }
+}
+
+/// World x, seen from the camera, of the laser line at distance `z_mm` on the optical axis' level.
+fn line_x_mm(rig: &Rig, z_mm: f64) -> f64 {
+    let plane = &rig.laser.plane;
+    let across = match rig.laser.line {
+        LineDirection::Vertical => plane.normal.x,
+        LineDirection::Horizontal => plane.normal.y,
+    };
+    (plane.offset_mm - plane.normal.z * z_mm) / across
+}
+
+fn surface_points(placed: &Placed<Cargo>) -> Vec<SurfacePoint> {
+    let measured = &placed.measured;
+    let colour = |position: u32| measured.cargo.texture.as_ref().map_or([128; 3], |strip| strip.beside(position));
+    let points = measured.profile.points.iter().map(|point| SurfacePoint {
+        point_in_world: placed.world_from_camera * point.point_in_camera,
+        rgb: colour(point.line_position),
+        confidence: point.confidence,
+        frame: measured.frame,
+    });
+    points.collect()
+}
+
+fn trajectory_row(placed: &Placed<Cargo>) -> TrajectoryRow {
+    let (measured, shift) = (&placed.measured, &placed.measured.shift);
+    TrajectoryRow {
+        frame: measured.frame,
+        time_s: measured.time_s,
+        dx_px: shift.dx_px,
+        dy_px: shift.dy_px,
+        scale: shift.scale,
+        world_from_camera: Some(placed.world_from_camera),
+        rotation_determined: false,
+        rows_found: measured.profile.points.len() as u32,
+        tracked: shift.corners.len() as u32,
+        residual_px: shift.residual_px,
+    }
+}
+
+fn hash_source(info: &SourceInfo, source_name: &str) -> Result<Vec<FileEntry>> {
+    let single = info.files.len() == 1;
+    let name = |path: &Path| match path.file_name() {
+        Some(file) if !single => file.to_string_lossy().into_owned(),
+        _ => source_name.to_string(),
+    };
+    info.files.iter().map(|file| FileEntry::of(file, name(file))).collect()
+}
+
+/// Says in words what the figures mean for a person.
+fn warn_of_quality(quality: &Quality, gaps: &[Gap], request: &Request, progress: &mut Progress<'_, '_>) -> Result<()> {
+    if quality.points == 0 {
+        let colour = format!("{:?}", request.rig.laser.colour).to_lowercase();
+        return progress.warn(format!(
+            "no point was measured: no {colour} laser line was found in any of the {} frames; check that the laser was on, \
+             and the rig's laser colour",
+            quality.frames
+        ));
+    }
+    let without = quality.frames - quality.frames_with_stripe;
+    if without > 0 {
+        progress.warn(format!("no laser line was found in {without} of {} frames", quality.frames))?;
+    }
+    if quality.frames == 1 {
+        return progress.warn("the run has a single frame: there is no motion, and the map is one column wide".into());
+    }
+    let lost = quality.frames - 1 - quality.frames_tracked;
+    if lost > 0 {
+        let places = gaps.iter().filter(|g| g.reason == "not_tracked").count();
+        progress.warn(format!(
+            "the motion was lost in {lost} of {} frames, in {places} places: lengths along the travel are too short there",
+            quality.frames
+        ))?;
+    }
+    Ok(())
+}

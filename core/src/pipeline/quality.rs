@@ -1,0 +1,154 @@
+//! How well the run was measured: figures, gaps, and the paper's resolution for the run's own geometry.
+
+use crate::export::manifest::{Gap, Quality, Resolution};
+use crate::rig::Rig;
+use crate::surface::Measured;
+use crate::triangulation::{depth_step_mm, paper_constants, view_height_mm};
+
+/// Gaps that the manifest lists, at most; later ones are only counted.
+const MAX_GAPS: usize = 1000;
+/// Values that a running median keeps, at most.
+const MEDIAN_SAMPLES: usize = 8192;
+
+/// Counts while the frames go by.
+pub(super) struct QualityCounter {
+    quality: Quality,
+    line_positions: u64,
+    gaps: Vec<Gap>,
+    distance_mm: RunningMedian,
+    residual_px: RunningMedian,
+    last_x_mm: f64,
+}
+
+impl QualityCounter {
+    pub(super) fn new() -> QualityCounter {
+        QualityCounter {
+            quality: Quality::default(),
+            line_positions: 0,
+            gaps: Vec::new(),
+            distance_mm: RunningMedian::default(),
+            residual_px: RunningMedian::default(),
+            last_x_mm: 0.0,
+        }
+    }
+
+    /// Counts a frame; `line_positions` is how many rows its stripe could have had, `x_mm` where it was placed.
+    pub(super) fn add<T>(&mut self, measured: &Measured<T>, line_positions: usize, x_mm: f64) {
+        let quality = &mut self.quality;
+        quality.frames += 1;
+        quality.points += measured.profile.points.len() as u64;
+        quality.duration_s = measured.time_s;
+        quality.travel_mm += (x_mm - self.last_x_mm).abs();
+        self.last_x_mm = x_mm;
+        self.line_positions += line_positions as u64;
+        if let Some(z_mm) = measured.profile.median_z_mm() {
+            quality.frames_with_stripe += 1;
+            self.distance_mm.add(z_mm);
+        } else {
+            add_gap(&mut self.gaps, measured.frame, "no_stripe");
+        }
+        if measured.shift.dx_px.is_some() {
+            quality.frames_tracked += 1;
+        } else if measured.frame > 0 {
+            add_gap(&mut self.gaps, measured.frame, "not_tracked");
+        }
+        if let Some(residual_px) = measured.shift.residual_px {
+            self.residual_px.add(residual_px);
+        }
+    }
+
+    /// The figures; `coverage` is the share of map pixels with a depth.
+    pub(super) fn finish(self, rig: &Rig, coverage: f64) -> (Quality, Vec<Gap>, Option<Resolution>) {
+        let mut quality = self.quality;
+        quality.coverage = coverage;
+        quality.rows_found = quality.points as f64 / self.line_positions.max(1) as f64;
+        quality.residual_px = self.residual_px.median();
+        let resolution = self.distance_mm.median().map(|z_mm| resolution(rig, z_mm, &quality));
+        (quality, self.gaps, resolution)
+    }
+}
+
+/// Equations (15) to (18) at the run's own distance, speed and frame rate.
+fn resolution(rig: &Rig, distance_mm: f64, quality: &Quality) -> Resolution {
+    let (c1_mm_px, c2_px) = paper_constants(rig);
+    let d_vertical_mm = view_height_mm(rig, distance_mm);
+    let steps = quality.frames.saturating_sub(1);
+    Resolution {
+        distance_mm,
+        c1_mm_px,
+        c2_px,
+        d_vertical_mm,
+        r_vertical_mm: d_vertical_mm / f64::from(rig.camera.height_px),
+        r_lateral_mm: (steps > 0).then(|| quality.travel_mm / steps as f64),
+        r_depth_mm: depth_step_mm(c1_mm_px, c2_px, distance_mm),
+    }
+}
+
+fn add_gap(gaps: &mut Vec<Gap>, frame: u32, reason: &str) {
+    let running = gaps.iter_mut().rev().find(|g| g.reason == reason).filter(|g| g.last_frame + 1 == frame);
+    if let Some(gap) = running {
+        gap.last_frame = frame;
+    } else if gaps.len() < MAX_GAPS {
+        gaps.push(Gap { first_frame: frame, last_frame: frame, reason: reason.to_string() });
+    }
+}
+
+/// The median of any number of values from a bounded number of them: when full, every second is dropped
+/// and from then on only every second is taken.
+#[derive(Default)]
+struct RunningMedian {
+    values: Vec<f64>,
+    every: usize,
+    seen: usize,
+}
+
+impl RunningMedian {
+    fn add(&mut self, value: f64) {
+        self.every = self.every.max(1);
+        if self.seen % self.every == 0 {
+            self.values.push(value);
+        }
+        self.seen += 1;
+        if self.values.len() == MEDIAN_SAMPLES {
+            let mut index = 0;
+            self.values.retain(|_| {
+                index += 1;
+                index % 2 == 1
+            });
+            self.every *= 2;
+        }
+    }
+
+    fn median(mut self) -> Option<f64> {
+        let middle = self.values.len() / 2;
+        (!self.values.is_empty()).then(|| *self.values.select_nth_unstable_by(middle, f64::total_cmp).1)
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn the_running_median_needs_no_more_room_for_more_values() {
+        let mut median = RunningMedian::default();
+        for i in 0..100_000 {
+            median.add(f64::from(i));
+            assert!(median.values.len() <= MEDIAN_SAMPLES);
+        }
+        let found = median.median().expect("values");
+        assert!((found - 50_000.0).abs() < 200.0, "{found}");
+    }
+
+    #[test]
+    fn neighbouring_frames_make_one_gap() {
+        let mut gaps = Vec::new();
+        for (frame, reason) in
+            [(3, "no_stripe"), (4, "no_stripe"), (4, "not_tracked"), (5, "no_stripe"), (9, "no_stripe")]
+        {
+            add_gap(&mut gaps, frame, reason);
+        }
+        let spans: Vec<_> = gaps.iter().map(|g| (g.first_frame, g.last_frame, g.reason.as_str())).collect();
+        assert_eq!(spans, [(3, 5, "no_stripe"), (4, 4, "not_tracked"), (9, 9, "no_stripe")]);
+    }
+}

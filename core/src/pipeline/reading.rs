@@ -1,0 +1,90 @@
+//! The reading thread: frames and their stripes, a few ahead of the rest of the work.
+
+use std::sync::mpsc::{Receiver, SyncSender, sync_channel};
+use std::thread::{Scope, ScopedJoinHandle};
+use std::time::{Duration, Instant};
+
+use crate::error::{Error, Result};
+use crate::recipe::Recipe;
+use crate::rig::Rig;
+use crate::source::{Frame, Source};
+use crate::stripe::{self, StripeSteps};
+
+/// Frames that wait between the two threads, at most.
+const FRAMES_WAIT: usize = 3;
+
+/// A frame with its stripe.
+pub(super) struct Seen {
+    pub frame: Frame,
+    pub steps: StripeSteps,
+}
+
+/// What the reading thread reports when it has ended.
+#[derive(Default)]
+pub(super) struct ReadingReport {
+    /// What the source says of itself, and what we say of it.
+    pub warnings: Vec<String>,
+    /// Time spent decoding.
+    pub decoding: Duration,
+    /// Time spent finding stripes.
+    pub stripes: Duration,
+}
+
+/// Starts the thread. It ends at the source's end, at an error, or when nobody listens any more.
+pub(super) fn start<'scope>(
+    scope: &'scope Scope<'scope, '_>,
+    source: Box<dyn Source>,
+    rig: &'scope Rig,
+    recipe: &'scope Recipe,
+) -> (Receiver<Result<Seen>>, ScopedJoinHandle<'scope, ReadingReport>) {
+    let (sender, receiver) = sync_channel(FRAMES_WAIT);
+    let thread = scope.spawn(move || read(source, rig, recipe, &sender));
+    (receiver, thread)
+}
+
+fn read(mut source: Box<dyn Source>, rig: &Rig, recipe: &Recipe, out: &SyncSender<Result<Seen>>) -> ReadingReport {
+    let mut report = ReadingReport::default();
+    let limit = recipe.limits.max_frames;
+    for count in 0.. {
+        let start = Instant::now();
+        let frame = match source.next_frame() {
+            Ok(Some(_)) if count >= limit => {
+                report.warnings.push(format!("only the first {limit} frames were processed (limits.max_frames)"));
+                break;
+            }
+            Ok(Some(frame)) => frame,
+            Ok(None) => break,
+            Err(error) => {
+                // Nobody listens only after a cancel, which has said its own.
+                let _ = out.send(Err(error));
+                break;
+            }
+        };
+        report.decoding += start.elapsed();
+        let start = Instant::now();
+        let seen = check_size(&frame, rig)
+            .and_then(|()| stripe::find(&frame.image, &rig.laser, &recipe.stripe))
+            .map(|steps| Seen { frame, steps });
+        report.stripes += start.elapsed();
+        let failed = seen.is_err();
+        if out.send(seen).is_err() || failed {
+            break;
+        }
+    }
+    report.warnings.extend(source.warnings());
+    report
+}
+
+/// A video may change its size on the way; the rig holds for one size.
+fn check_size(frame: &Frame, rig: &Rig) -> Result<()> {
+    let (width_px, height_px) = (frame.image.width_px(), frame.image.height_px());
+    if (width_px, height_px) == (rig.camera.width_px, rig.camera.height_px) {
+        return Ok(());
+    }
+    Err(Error::field(
+        format!("frame {}", frame.index),
+        "image size",
+        format!("{width_px}x{height_px} px"),
+        format!("{}x{} px like the frames before", rig.camera.width_px, rig.camera.height_px),
+    ))
+}

@@ -1,0 +1,209 @@
+//! What is recorded of some frames: the image, and what the method found in it.
+
+use jpeg_encoder::{ColorType, Encoder};
+use opencv::core::{Mat, MatTraitConst, MatTraitConstManual, Size, Vec3b};
+use opencv::imgproc;
+use rerun::log::Chunk;
+use rerun::{Arrows2D, EncodedImage, Pinhole, Points2D, Points3D, Radius};
+
+use super::budget::Share;
+use super::data::{fixed, row};
+use super::{FrameSteps, charts, entity, metres};
+use crate::error::{Error, Result};
+use crate::geometry::RawPixel;
+use crate::recipe::RecordingOptions;
+use crate::rig::{LaserColour, Rig};
+use crate::source::Image;
+use crate::stripe::Stripe;
+
+const FRAME_QUALITY: u8 = 80;
+const AREA_QUALITY: u8 = 70;
+/// A corner's flow is a few pixels from frame to frame: drawn this much longer, it can be seen.
+pub(super) const FLOW_MAGNIFIED: f32 = 5.0;
+/// The line in space is drawn with at most this many points.
+const PROFILE_POINTS: usize = 400;
+const SPOT_COLOUR: [u8; 3] = [255, 40, 40];
+const CORNER_COLOUR: [u8; 3] = [64, 156, 255];
+
+/// Decides which frames are shown, and shows them.
+pub(super) struct Images {
+    width_px: u32,
+    height_px: u32,
+    scale: [f64; 2],
+    interval_s: f64,
+    duration_expected_s: Option<f64>,
+    last_s: Option<f64>,
+    shown: u32,
+    shown_bytes: usize,
+}
+
+impl Images {
+    pub(super) fn new(options: &RecordingOptions, rig: &Rig, duration_expected_s: Option<f64>) -> Images {
+        let (full_width, full_height) = (f64::from(rig.camera.width_px), f64::from(rig.camera.height_px));
+        let width_px = options.image_width_px.min(rig.camera.width_px);
+        let height_px = ((f64::from(width_px) * full_height / full_width).round() as u32).max(1);
+        Images {
+            width_px,
+            height_px,
+            scale: [f64::from(width_px) / full_width, f64::from(height_px) / full_height],
+            interval_s: 1.0 / options.images_per_s,
+            duration_expected_s,
+            last_s: None,
+            shown: 0,
+            shown_bytes: 0,
+        }
+    }
+
+    /// The camera as the viewer draws it, and how the overlays look.
+    pub(super) fn opening(&self, rig: &Rig) -> Result<Vec<Chunk>> {
+        let (camera, [sx, sy]) = (&rig.camera, self.scale);
+        let (fx, fy) = ((camera.fx_px * sx) as f32, (camera.fy_px * sy) as f32);
+        let [cx, cy] = self.to_shown(RawPixel { u_px: camera.cx_px, v_px: camera.cy_px });
+        // As long as the laser is away from the camera: large enough to see, small beside the wall.
+        let distance_m = (rig.laser.plane.offset_mm.abs() / 1000.0).clamp(0.03, 0.4);
+        let pinhole = Pinhole::new([[fx, 0.0, 0.0], [0.0, fy, 0.0], [cx, cy, 1.0]])
+            .with_resolution([self.width_px as f32, self.height_px as f32])
+            .with_image_plane_distance(distance_m as f32);
+        let laser = match rig.laser.colour {
+            LaserColour::Green => [60, 255, 60],
+            LaserColour::Red => [255, 60, 60],
+            LaserColour::Blue => [80, 120, 255],
+        };
+        let spots = Points2D::update_fields().with_radii([Radius::new_ui_points(1.5)]).with_colors([SPOT_COLOUR]);
+        let mut chunks = vec![
+            fixed(entity::IMAGE, &pinhole)?,
+            fixed(entity::SPOTS, &spots)?,
+            fixed(entity::AREA_SPOTS, &spots)?,
+            fixed(
+                entity::CORNERS,
+                &Arrows2D::update_fields().with_radii([Radius::new_ui_points(1.0)]).with_colors([CORNER_COLOUR]),
+            )?,
+            fixed(
+                entity::PROFILE,
+                &Points3D::update_fields().with_radii([Radius::new_ui_points(3.0)]).with_colors([laser]),
+            )?,
+        ];
+        chunks.extend(charts::opening()?);
+        Ok(chunks)
+    }
+
+    /// Whether the frame at this time is one to show.
+    pub(super) fn due(&self, time_s: f64, share: &Share) -> bool {
+        let Some(last_s) = self.last_s else { return true };
+        let interval_s = self.interval_s * f64::from(share.halvings()).exp2();
+        // Half a millisecond of grace, so that 5 images a second of a 60 Hz video are every 12th frame.
+        time_s - last_s >= interval_s - 0.0005
+    }
+
+    /// The frame with all its steps; nothing where the budget is used up.
+    pub(super) fn show(&mut self, steps: &FrameSteps<'_>, image: &Image, share: &mut Share) -> Result<Vec<Chunk>> {
+        let at = steps.moment();
+        self.last_s = Some(at.time_s);
+        let small = self.shrink(image)?;
+        let mut jpegs = vec![(entity::IMAGE, self.jpeg(&small, FRAME_QUALITY)?)];
+        if let Some(mask) = steps.effective_area {
+            jpegs.push((entity::AREA, self.jpeg(&self.effective_area(small, image, mask)?, AREA_QUALITY)?));
+        }
+        let spots = self.spots(steps.stripe);
+        let overlay_bytes = 16 * spots.len() + 16 * steps.shift.corners.len() + 12 * PROFILE_POINTS + charts::BYTES;
+        let bytes = jpegs.iter().map(|(_, jpeg)| jpeg.len()).sum::<usize>() + overlay_bytes;
+        if !share.spend(bytes) {
+            return Ok(vec![]);
+        }
+        self.shown += 1;
+        self.shown_bytes += bytes;
+        if let Some(duration_s) = self.duration_expected_s {
+            let mean_bytes = self.shown_bytes as f64 / f64::from(self.shown);
+            share.plan(duration_s / self.interval_s * mean_bytes);
+        }
+
+        let mut chunks = Vec::new();
+        for (entity, jpeg) in jpegs {
+            chunks.push(row(entity, at, &EncodedImage::new(jpeg).with_media_type("image/jpeg"))?);
+        }
+        let spots = Points2D::update_fields().with_positions(spots);
+        chunks.push(row(entity::SPOTS, at, &spots)?);
+        chunks.push(row(entity::AREA_SPOTS, at, &spots)?);
+        chunks.push(row(entity::CORNERS, at, &self.corners(steps))?);
+        chunks.push(row(entity::PROFILE, at, &profile(steps))?);
+        chunks.extend(charts::show(steps, image)?);
+        Ok(chunks)
+    }
+
+    /// A pixel of the frame in the shown image, where the corner (not the centre) of the first pixel is (0, 0).
+    fn to_shown(&self, pixel: RawPixel) -> [f32; 2] {
+        [((pixel.u_px + 0.5) * self.scale[0]) as f32, ((pixel.v_px + 0.5) * self.scale[1]) as f32]
+    }
+
+    /// The spots, no denser than the shown image's own pixels.
+    fn spots(&self, stripe: &Stripe) -> Vec<[f32; 2]> {
+        let step = (1.0 / self.scale[0]).ceil().max(1.0) as usize;
+        stripe.spots().filter(|(i, _)| i % step == 0).map(|(_, pixel)| self.to_shown(pixel)).collect()
+    }
+
+    fn corners(&self, steps: &FrameSteps<'_>) -> Arrows2D {
+        let corners = &steps.shift.corners;
+        let shown = |p: [f32; 2]| self.to_shown(RawPixel { u_px: f64::from(p[0]), v_px: f64::from(p[1]) });
+        Arrows2D::update_fields().with_origins(corners.iter().map(|c| shown(c.from_px))).with_vectors(
+            corners.iter().map(|c| {
+                let (from, to) = (shown(c.from_px), shown(c.to_px));
+                [FLOW_MAGNIFIED * (to[0] - from[0]), FLOW_MAGNIFIED * (to[1] - from[1])]
+            }),
+        )
+    }
+
+    /// The image at the shown size.
+    fn shrink(&self, image: &Image) -> Result<Vec<u8>> {
+        if (image.width_px(), image.height_px()) == (self.width_px, self.height_px) {
+            return Ok(image.bgr().to_vec());
+        }
+        let full =
+            Mat::new_rows_cols_with_bytes::<Vec3b>(image.height_px() as i32, image.width_px() as i32, image.bgr())?;
+        self.resized(&full)
+    }
+
+    fn resized(&self, full: &impl opencv::core::ToInputArray) -> Result<Vec<u8>> {
+        let mut small = Mat::default();
+        let size = Size::new(self.width_px as i32, self.height_px as i32);
+        imgproc::resize(full, &mut small, size, 0.0, 0.0, imgproc::INTER_AREA)?;
+        debug_assert!(small.is_continuous());
+        Ok(small.data_bytes()?.to_vec())
+    }
+
+    /// Image AND mask, at the shown size.
+    fn effective_area(&self, mut small: Vec<u8>, image: &Image, mask: &[u8]) -> Result<Vec<u8>> {
+        let (width, height) = (image.width_px() as usize, image.height_px() as usize);
+        if mask.len() != width * height {
+            return Err(Error::internal(
+                "recording",
+                format!("a mask of {} for {width} x {height} pixels", mask.len()),
+            ));
+        }
+        let full = Mat::new_rows_cols_with_bytes::<u8>(height as i32, width as i32, mask)?;
+        let mask = self.resized(&full)?;
+        for (pixel, mask) in small.chunks_exact_mut(3).zip(&mask) {
+            pixel.iter_mut().for_each(|c| *c = (u16::from(*c) * u16::from(*mask) / 255) as u8);
+        }
+        Ok(small)
+    }
+
+    fn jpeg(&self, bgr: &[u8], quality: u8) -> Result<Vec<u8>> {
+        jpeg(bgr, self.width_px, self.height_px, ColorType::Bgr, quality)
+    }
+}
+
+/// A JPEG file.
+pub(super) fn jpeg(pixels: &[u8], width_px: u32, height_px: u32, colours: ColorType, quality: u8) -> Result<Vec<u8>> {
+    let too_large = |_| Error::internal("recording", format!("an image of {width_px} x {height_px} px"));
+    let (width, height) = (u16::try_from(width_px).map_err(too_large)?, u16::try_from(height_px).map_err(too_large)?);
+    let mut bytes = Vec::new();
+    let encoder = Encoder::new(&mut bytes, quality);
+    encoder.encode(pixels, width, height, colours).map_err(|e| Error::internal("recording", e))?;
+    Ok(bytes)
+}
+
+/// The line as measured in this frame, in space.
+fn profile(steps: &FrameSteps<'_>) -> Points3D {
+    let step = steps.points.len().div_ceil(PROFILE_POINTS).max(1);
+    Points3D::update_fields().with_positions(steps.points.iter().step_by(step).map(|p| metres(&p.point_in_world)))
+}

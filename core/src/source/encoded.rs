@@ -1,0 +1,252 @@
+//! The frames of a source as they are stored, not decoded: what the archive keeps.
+
+use std::path::{Path, PathBuf};
+
+use ffmpeg_the_third as ffmpeg;
+
+use ffmpeg::codec::Id;
+
+use super::folder::image_files;
+use super::video::{display_name, open_container};
+use super::{DEFAULT_FOLDER_FPS, EncodedFormat, EncodedFrame};
+use crate::error::{Error, Result};
+
+/// The frames of a source as stored, in decoding order.
+pub struct EncodedFrames {
+    name: String,
+    kind: Kind,
+}
+
+enum Kind {
+    Video(Box<VideoPackets>),
+    Folder { files: Vec<PathBuf>, next: usize, fps: f64 },
+}
+
+struct VideoPackets {
+    input: ffmpeg::format::context::Input,
+    stream: usize,
+    time_base_s: f64,
+    first_time_s: f64,
+    format: EncodedFormat,
+    /// Set where packets carry length prefixes (MP4, MKV) instead of start codes.
+    parameter_sets: Option<ParameterSets>,
+}
+
+/// Opens the source for its encoded frames.
+///
+/// # Errors
+/// [`Error::Input`] where it cannot be opened, or is in a codec that archives have no schema for.
+pub fn encoded_frames(path: &Path, name: &str, fps: Option<f64>) -> Result<EncodedFrames> {
+    let kind = if path.is_dir() {
+        Kind::Folder { files: image_files(path, name)?, next: 0, fps: fps.unwrap_or(DEFAULT_FOLDER_FPS) }
+    } else {
+        Kind::Video(Box::new(VideoPackets::open(path, name)?))
+    };
+    Ok(EncodedFrames { name: name.to_string(), kind })
+}
+
+impl Iterator for EncodedFrames {
+    type Item = Result<EncodedFrame>;
+
+    fn next(&mut self) -> Option<Self::Item> {
+        match &mut self.kind {
+            Kind::Video(packets) => packets.next().map(Ok),
+            Kind::Folder { files, next, fps } => {
+                let file = files.get(*next)?;
+                let index = *next;
+                *next += 1;
+                Some(image_file(file, index as f64 / *fps, &self.name))
+            }
+        }
+    }
+}
+
+fn image_file(file: &Path, time_s: f64, name: &str) -> Result<EncodedFrame> {
+    let data = std::fs::read(file).map_err(|e| Error::io(file, e))?;
+    let format = match data.get(..4) {
+        Some([0xff, 0xd8, ..]) => EncodedFormat::Jpeg,
+        Some([0x89, b'P', b'N', b'G']) => EncodedFormat::Png,
+        Some(b"RIFF") => EncodedFormat::Webp,
+        _ => {
+            return Err(Error::input(
+                format!("{name}/{}", display_name(file)),
+                "an image format archives cannot hold",
+                "JPEG, PNG or WebP",
+            ));
+        }
+    };
+    Ok(EncodedFrame { time_s, format, key: true, data })
+}
+
+impl VideoPackets {
+    fn open(path: &Path, name: &str) -> Result<VideoPackets> {
+        let input = open_container(path, name)?;
+        let stream = input
+            .streams()
+            .best(ffmpeg::media::Type::Video)
+            .ok_or_else(|| Error::input(name, "no video stream", "a file with a video stream"))?;
+        let parameters = stream.parameters();
+        let format = match parameters.id() {
+            Id::H264 => EncodedFormat::H264,
+            Id::HEVC => EncodedFormat::H265,
+            Id::VP9 => EncodedFormat::Vp9,
+            Id::AV1 => EncodedFormat::Av1,
+            Id::MJPEG => EncodedFormat::Jpeg,
+            Id::PNG => EncodedFormat::Png,
+            Id::WEBP => EncodedFormat::Webp,
+            other => {
+                return Err(Error::input(
+                    name,
+                    format!("codec {other:?}"),
+                    "H.264, H.265, VP9, AV1, MJPEG or PNG: archives have no schema for others",
+                ));
+            }
+        };
+        let parameter_sets = match format {
+            EncodedFormat::H264 => ParameterSets::from_avcc(extradata(&stream)),
+            EncodedFormat::H265 => ParameterSets::from_hvcc(extradata(&stream)),
+            _ => None,
+        };
+        let base = stream.time_base();
+        let time_base_s = f64::from(base.0) / f64::from(base.1.max(1));
+        let start = stream.start_time();
+        let first_time_s = if start == i64::MIN { 0.0 } else { start as f64 * time_base_s };
+        Ok(VideoPackets { stream: stream.index(), time_base_s, first_time_s, format, parameter_sets, input })
+    }
+
+    fn next(&mut self) -> Option<EncodedFrame> {
+        let mut packet = ffmpeg::Packet::empty();
+        loop {
+            match packet.read(&mut self.input) {
+                Ok(()) if packet.stream() == self.stream => {}
+                Ok(()) => continue,
+                // A cut file ends here; the frames' own reading says so in its warnings.
+                Err(_) => return None,
+            }
+            let Some(data) = packet.data() else { continue };
+            let stamp = packet.pts().or(packet.dts()).unwrap_or(0);
+            return Some(EncodedFrame {
+                time_s: stamp as f64 * self.time_base_s - self.first_time_s,
+                format: self.format,
+                key: packet.is_key(),
+                data: match &self.parameter_sets {
+                    Some(sets) => sets.annex_b(data, packet.is_key()),
+                    None => data.to_vec(),
+                },
+            });
+        }
+    }
+}
+
+/// The codec's set-up bytes of a stream.
+#[expect(
+    unsafe_code,
+    reason = "the FFmpeg wrapper has no accessor for extradata; pointer and size are FFmpeg's own pair"
+)]
+fn extradata<'a>(stream: &'a ffmpeg::format::stream::Stream<'_>) -> &'a [u8] {
+    let parameters = stream.parameters();
+    // SAFETY: FFmpeg keeps `extradata` valid for `extradata_size` bytes as long as the stream lives, and
+    // the returned borrow cannot outlive the stream.
+    unsafe {
+        let raw = parameters.as_ptr();
+        let (data, size) = ((*raw).extradata, (*raw).extradata_size);
+        match usize::try_from(size) {
+            Ok(size) if size > 0 && !data.is_null() => std::slice::from_raw_parts(data, size),
+            _ => &[],
+        }
+    }
+}
+
+/// The parameter sets of an MP4 or MKV stream, and how long its length prefixes are.
+struct ParameterSets {
+    length_bytes: usize,
+    /// The sets in Annex B form.
+    annex_b: Vec<u8>,
+}
+
+const START_CODE: [u8; 4] = [0, 0, 0, 1];
+
+impl ParameterSets {
+    /// From an AVCDecoderConfigurationRecord (ISO/IEC 14496-15); `None` where it is not one.
+    fn from_avcc(extradata: &[u8]) -> Option<ParameterSets> {
+        if extradata.first() != Some(&1) {
+            return None;
+        }
+        let length_bytes = usize::from(extradata.get(4)? & 3) + 1;
+        let mut rest = extradata.get(5..)?;
+        let mut annex_b = Vec::new();
+        for mask in [0x1f, 0xff] {
+            let count = rest.first()? & mask;
+            rest = &rest[1..];
+            for _ in 0..count {
+                rest = take_set(rest, &mut annex_b)?;
+            }
+        }
+        Some(ParameterSets { length_bytes, annex_b })
+    }
+
+    /// From an HEVCDecoderConfigurationRecord (ISO/IEC 14496-15); `None` where it is not one.
+    fn from_hvcc(extradata: &[u8]) -> Option<ParameterSets> {
+        if extradata.first() != Some(&1) {
+            return None;
+        }
+        let length_bytes = usize::from(extradata.get(21)? & 3) + 1;
+        let arrays = *extradata.get(22)?;
+        let mut rest = extradata.get(23..)?;
+        let mut annex_b = Vec::new();
+        for _ in 0..arrays {
+            let count = u16::from_be_bytes([*rest.get(1)?, *rest.get(2)?]);
+            rest = &rest[3..];
+            for _ in 0..count {
+                rest = take_set(rest, &mut annex_b)?;
+            }
+        }
+        Some(ParameterSets { length_bytes, annex_b })
+    }
+
+    /// A packet with start codes instead of lengths, the parameter sets before a key frame.
+    fn annex_b(&self, packet: &[u8], key: bool) -> Vec<u8> {
+        let mut out = if key { self.annex_b.clone() } else { Vec::new() };
+        let mut rest = packet;
+        while rest.len() > self.length_bytes {
+            let (length, tail) = rest.split_at(self.length_bytes);
+            let size = length.iter().fold(0usize, |n, b| (n << 8) | usize::from(*b)).min(tail.len());
+            out.extend(START_CODE);
+            out.extend(&tail[..size]);
+            rest = &tail[size..];
+        }
+        out
+    }
+}
+
+fn take_set<'a>(bytes: &'a [u8], annex_b: &mut Vec<u8>) -> Option<&'a [u8]> {
+    let size = usize::from(u16::from_be_bytes([*bytes.first()?, *bytes.get(1)?]));
+    annex_b.extend(START_CODE);
+    annex_b.extend(bytes.get(2..2 + size)?);
+    bytes.get(2 + size..)
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn length_prefixes_become_start_codes() {
+        let avcc = [1, 0x64, 0, 31, 0xff, 0xe1, 0, 2, 0x67, 0xaa, 1, 0, 1, 0x68];
+        let sets = ParameterSets::from_avcc(&avcc).expect("avcC");
+        assert_eq!(sets.length_bytes, 4);
+        let packet = [0, 0, 0, 2, 0x65, 0x88, 0, 0, 0, 1, 0x06];
+        let expected = [0, 0, 0, 1, 0x67, 0xaa, 0, 0, 0, 1, 0x68, 0, 0, 0, 1, 0x65, 0x88, 0, 0, 0, 1, 0x06];
+        assert_eq!(sets.annex_b(&packet, true), expected);
+        assert_eq!(sets.annex_b(&packet, false), expected[11..]);
+        // A length past the packet's end takes what is there.
+        assert_eq!(sets.annex_b(&[0, 0, 0, 9, 0x41], false), [0, 0, 0, 1, 0x41]);
+    }
+
+    #[test]
+    fn broken_records_are_not_records() {
+        assert!(ParameterSets::from_avcc(&[1, 2, 3]).is_none());
+        assert!(ParameterSets::from_avcc(&[1, 0, 0, 0, 0xff, 0xe1, 0xff, 0xff]).is_none());
+        assert!(ParameterSets::from_hvcc(&[0; 30]).is_none());
+    }
+}

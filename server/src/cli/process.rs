@@ -1,0 +1,296 @@
+//! `stria process`: one run in, its products out. A person uses it, and every worker does.
+
+use std::io::{Read, Write};
+use std::ops::ControlFlow;
+use std::path::{Path, PathBuf};
+use std::sync::Arc;
+use std::sync::atomic::{AtomicBool, Ordering};
+use std::time::Instant;
+
+use clap::Args;
+use stria_core::export::manifest::Manifest;
+use stria_core::pipeline::{self, Event, ProductGroup, Request};
+use stria_core::recipe::{self, OptionInfo, Range, Recipe};
+use stria_core::rig::Rig;
+
+use super::progress::{JobBar, duration, size};
+use super::{Failed, Outcome, Success};
+use crate::wire::child::{End, Failure};
+
+/// The exit code of a cancelled process.
+const CANCELLED: i32 = 130;
+
+/// Process a run: a video or a folder of images, with its rig, into a folder of products
+#[derive(Args)]
+#[command(after_long_help = options_help())]
+#[command(
+    after_help = "Example: stria process run.mp4 --rig rig.toml --out products\n`stria process --help` lists the options for --set."
+)]
+pub(super) struct Process {
+    /// A video file (whatever FFmpeg reads), or a folder of images, sorted by name
+    source: PathBuf,
+    /// The rig that it was recorded with: a TOML or JSON file
+    #[arg(long, value_name = "FILE", env = "STRIA_RIG")]
+    rig: PathBuf,
+    /// How to process: a built-in recipe's name, or a TOML file
+    #[arg(long, value_name = "NAME|FILE", default_value = recipe::BUILT_IN[0], env = "STRIA_RECIPE")]
+    recipe: String,
+    /// Change one value of the recipe; may be given several times
+    #[arg(long, value_name = "KEY=VALUE")]
+    set: Vec<String>,
+    /// The folder for the products; it is made, or must be empty
+    #[arg(long, value_name = "DIR")]
+    out: PathBuf,
+    /// Make only these product groups, separated by commas
+    #[arg(long, value_name = "A,B", value_delimiter = ',', value_parser = product_group)]
+    only: Vec<ProductGroup>,
+    /// Print one JSON object a line (events, then the result) for programs
+    #[arg(long)]
+    json: bool,
+    /// Frames a second of a folder of images
+    #[arg(long, value_name = "F")]
+    fps: Option<f64>,
+    /// When the run was recorded (RFC 3339); when nothing is said, the time of the file
+    #[arg(long, value_name = "TIME")]
+    recorded_at: Option<jiff::Timestamp>,
+    /// The name of the source in messages and the manifest
+    #[arg(long, hide = true)]
+    name: Option<String>,
+    /// Write numbered recording segments while the work goes on
+    #[arg(long, hide = true)]
+    live_segments: bool,
+    /// End at once when stdin ends: the parent died, or wants an end
+    #[arg(long, hide = true)]
+    exit_with_stdin: bool,
+}
+
+impl Process {
+    pub(super) fn run(self) -> Outcome {
+        let stop = Arc::new(AtomicBool::new(false));
+        stop_on_signals(stop.clone())?;
+        if self.exit_with_stdin {
+            exit_with_stdin()?;
+        }
+        let begun = Instant::now();
+        let result = self.process(&stop);
+        match result {
+            Ok(manifest) => {
+                let warned = !manifest.warnings.is_empty();
+                if self.json {
+                    say_json(&End::Result { manifest: Box::new(manifest) })?;
+                } else {
+                    summary(&manifest, &self.out, begun.elapsed().as_secs_f64());
+                }
+                Ok(if warned { Success::DoneWithWarnings } else { Success::Done })
+            }
+            Err(error) => {
+                if self.json {
+                    say_json(&End::Error(Failure::from(&error)))?;
+                }
+                Err(error.into())
+            }
+        }
+    }
+
+    fn process(&self, stop: &AtomicBool) -> stria_core::Result<Manifest> {
+        let request = self.request()?;
+        let folder_was_there = self.out.exists();
+        let bar = (!self.json).then(JobBar::new);
+        let result = pipeline::process(&request, &mut |event| {
+            self.show(bar.as_ref(), event);
+            if stop.load(Ordering::Relaxed) { ControlFlow::Break(()) } else { ControlFlow::Continue(()) }
+        });
+        if let Some(bar) = &bar {
+            bar.clear();
+        }
+        if result.is_err() {
+            remove_halves(&self.out, folder_was_there);
+        }
+        result
+    }
+
+    fn request(&self) -> stria_core::Result<Request> {
+        let rig = Rig::load(&self.rig)?;
+        let mut recipe = Recipe::load(&self.recipe)?;
+        for change in &self.set {
+            let Some((key, value)) = change.split_once('=') else {
+                return Err(stria_core::Error::input(
+                    format!("--set {change}"),
+                    "no '='",
+                    "key=value, such as stripe.k=0.8",
+                ));
+            };
+            recipe.set(key.trim(), value.trim())?;
+        }
+        refuse_used_folder(&self.out)?;
+        let name = self.source.file_name().map(|n| n.to_string_lossy().into_owned());
+        let only = if self.only.is_empty() { ProductGroup::ALL.to_vec() } else { self.only.clone() };
+        Ok(Request {
+            source: self.source.clone(),
+            source_name: self.name.clone().or(name).unwrap_or_else(|| self.source.display().to_string()),
+            fps: self.fps,
+            recorded_at: self.recorded_at.unwrap_or_else(|| time_of(&self.source)),
+            rig,
+            recipe,
+            out_dir: self.out.clone(),
+            products: only,
+            live_segments: self.live_segments,
+        })
+    }
+
+    fn show(&self, bar: Option<&JobBar>, event: Event) {
+        let Some(bar) = bar else {
+            // Whoever read this has gone: nobody wants the result any more.
+            if say_json(&event).is_err() {
+                std::process::exit(CANCELLED);
+            }
+            return;
+        };
+        match event {
+            Event::Progress { stage, fraction, frames, frames_total, frames_per_s, time_left_s } => {
+                bar.show(&stage, fraction, frames, frames_total, frames_per_s, time_left_s);
+            }
+            Event::Warning { message } => bar.say(&format!("warning: {message}")),
+            Event::Segment { .. } => {}
+        }
+    }
+}
+
+/// When a file was last written; now, where nobody knows.
+fn time_of(path: &Path) -> jiff::Timestamp {
+    let written = std::fs::metadata(path).and_then(|facts| facts.modified()).ok();
+    written.and_then(|time| jiff::Timestamp::try_from(time).ok()).unwrap_or_else(jiff::Timestamp::now)
+}
+
+fn say_json(line: &impl serde::Serialize) -> Result<(), Failed> {
+    let text = serde_json::to_string(line).map_err(|e| Failed::Other(format!("a line is not JSON: {e}")))?;
+    let mut out = std::io::stdout().lock();
+    writeln!(out, "{text}").and_then(|()| out.flush()).map_err(|e| Failed::Other(format!("stdout: {e}")))
+}
+
+/// The first Ctrl-C (or SIGTERM) stops between two frames, the second one at once.
+fn stop_on_signals(stop: Arc<AtomicBool>) -> Result<(), Failed> {
+    let failed = |e: std::io::Error| Failed::Other(format!("signals cannot be heard: {e}"));
+    let runtime = tokio::runtime::Builder::new_current_thread().enable_io().build().map_err(failed)?;
+    let mut signals = {
+        let _inside = runtime.enter();
+        super::serve::StopSignals::listen().map_err(failed)?
+    };
+    let listen = move || {
+        runtime.block_on(async {
+            signals.next().await;
+            stop.store(true, Ordering::Relaxed);
+            signals.next().await;
+            std::process::exit(CANCELLED);
+        });
+    };
+    std::thread::Builder::new().name("signals".into()).spawn(listen).map_err(failed)?;
+    Ok(())
+}
+
+/// The parent holds the other end of stdin. When it closes, this process must not go on alone.
+fn exit_with_stdin() -> Result<(), Failed> {
+    let wait = || {
+        let mut byte = [0u8; 64];
+        let mut stdin = std::io::stdin().lock();
+        while !matches!(stdin.read(&mut byte), Ok(0) | Err(_)) {}
+        std::process::exit(CANCELLED);
+    };
+    let thread = std::thread::Builder::new().name("stdin".into()).spawn(wait);
+    thread.map(|_| ()).map_err(|e| Failed::Other(format!("stdin cannot be watched: {e}")))
+}
+
+/// Products never mix with other files, and never replace older ones.
+fn refuse_used_folder(out: &Path) -> stria_core::Result<()> {
+    let found = match std::fs::read_dir(out) {
+        Ok(mut entries) => match entries.next() {
+            None => return Ok(()),
+            Some(_) => "not empty",
+        },
+        Err(e) if e.kind() == std::io::ErrorKind::NotFound => return Ok(()),
+        Err(e) if e.kind() == std::io::ErrorKind::NotADirectory => "not a folder",
+        Err(e) => return Err(stria_core::Error::io(out, e)),
+    };
+    Err(stria_core::Error::input(format!("--out {}", out.display()), found, "a new or empty folder"))
+}
+
+/// After a failure nothing half-made stays. The folder was new or empty when we began.
+fn remove_halves(out: &Path, folder_was_there: bool) {
+    let removed = match folder_was_there {
+        false => std::fs::remove_dir_all(out),
+        true => std::fs::read_dir(out).and_then(|entries| {
+            entries.flatten().map(|e| e.path()).try_for_each(|path| match path.is_dir() {
+                true => std::fs::remove_dir_all(path),
+                false => std::fs::remove_file(path),
+            })
+        }),
+    };
+    if let Err(error) = removed
+        && error.kind() != std::io::ErrorKind::NotFound
+    {
+        eprintln!("stria: {}: what was half-made could not be removed: {error}", out.display());
+    }
+}
+
+fn summary(manifest: &Manifest, out: &Path, seconds: f64) {
+    let q = &manifest.quality;
+    let bytes: u64 = manifest.products.iter().map(|p| p.bytes).sum();
+    println!(
+        "Done in {}: {} frames, {:.1} frames/s",
+        duration(seconds),
+        q.frames,
+        q.frames as f64 / seconds.max(0.001)
+    );
+    println!("  products  {} files, {} in {}", manifest.products.len(), size(bytes), out.display());
+    println!(
+        "  stripe    {} of {} frames, {:.1} % of their rows",
+        q.frames_with_stripe,
+        q.frames,
+        100.0 * q.rows_found
+    );
+    println!(
+        "  motion    {} of {} frames, {:.1} mm in {:.1} s",
+        q.frames_tracked,
+        q.frames.saturating_sub(1),
+        q.travel_mm,
+        q.duration_s
+    );
+    println!("  surface   {} points, {:.1} % of the map", q.points, 100.0 * q.coverage);
+    if let Some(r) = &manifest.resolution {
+        println!(
+            "  one px    {:.2} mm deep at {:.0} mm, {:.2} mm along the line",
+            r.r_depth_mm, r.distance_mm, r.r_vertical_mm
+        );
+    }
+    for warning in &manifest.warnings {
+        println!("  warning   {warning}");
+    }
+}
+
+fn product_group(text: &str) -> Result<ProductGroup, String> {
+    serde_json::from_value(text.trim().into()).map_err(|_| format!("expected {}", group_names().join(", ")))
+}
+
+fn group_names() -> Vec<String> {
+    let name = |group| serde_json::to_value(group).ok()?.as_str().map(String::from);
+    ProductGroup::ALL.iter().filter_map(name).collect()
+}
+
+/// Every option of the recipes, for `--help`.
+fn options_help() -> String {
+    let mut text = format!(
+        "Built-in recipes: {} (the first is the default)\nProduct groups for --only: {}\n\n\
+         Options for --set (key = default, range):\n",
+        recipe::BUILT_IN.join(", "),
+        group_names().join(", ")
+    );
+    for OptionInfo { key, unit, default, range, doc } in recipe::options() {
+        let range = match range {
+            Range::Number { min, max, .. } => format!("{min} to {max} {unit}"),
+            Range::Flag => "true or false".into(),
+            Range::Choice { of } => of.join(", "),
+        };
+        text += &format!("  {key} = {default}, {}\n          {doc}\n", range.trim_end());
+    }
+    text + "\nExit codes: 0 done, 1 failed, 2 wrong usage or input, 3 done with warnings, 130 cancelled."
+}

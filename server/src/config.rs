@@ -1,0 +1,166 @@
+//! Addresses, folders and limits: what the server may use and how long it waits. Flags set some; all have names here.
+
+use std::net::SocketAddr;
+use std::path::PathBuf;
+use std::time::Duration;
+
+/// Bytes in a GB as the flags count them.
+pub const GB: u64 = 1_000_000_000;
+
+/// What `stria serve` was told.
+#[derive(Clone, Debug)]
+pub struct Config {
+    /// Where to listen.
+    pub listen: SocketAddr,
+    /// The folder with the records, the store and the scratch space.
+    pub data_dir: PathBuf,
+    /// Jobs that run at the same time.
+    pub workers: usize,
+    /// Limits of requests.
+    pub requests: RequestLimits,
+    /// Limits of jobs.
+    pub jobs: JobLimits,
+}
+
+impl Config {
+    /// The records.
+    pub fn database(&self) -> PathBuf {
+        self.data_dir.join("stria.db")
+    }
+
+    /// The files of the store.
+    pub fn store(&self) -> PathBuf {
+        self.data_dir.join("store")
+    }
+
+    /// Uploads that are still coming in.
+    pub fn incoming(&self) -> PathBuf {
+        self.data_dir.join("incoming")
+    }
+
+    /// What attempts write before it is published.
+    pub fn scratch(&self) -> PathBuf {
+        self.data_dir.join("scratch")
+    }
+
+    /// Held by the one server that uses the folder.
+    pub fn lock(&self) -> PathBuf {
+        self.data_dir.join("lock")
+    }
+
+    /// The name of this folder's workers, the same after a restart.
+    pub fn node(&self) -> PathBuf {
+        self.data_dir.join("node")
+    }
+}
+
+/// Limits of requests.
+#[derive(Clone, Debug)]
+pub struct RequestLimits {
+    /// Largest upload, bytes.
+    pub upload_bytes: u64,
+    /// Largest body of any other request, and largest field of a form beside its file, bytes.
+    pub small_body_bytes: usize,
+    /// Most fields of a form.
+    pub form_fields: usize,
+    /// Uploads at the same time; further ones are asked to come back.
+    pub uploads_at_once: usize,
+    /// Connections at the same time; further ones wait to be accepted.
+    pub connections: usize,
+    /// How long a client may take to send the head of a request, and to stay connected without one.
+    pub head_timeout: Duration,
+    /// How long a sender may be silent in the middle of a body.
+    pub sender_silence: Duration,
+    /// How long a receiver may take nothing of what is there for it.
+    pub receiver_silence: Duration,
+    /// How long anything but an upload may take until its answer begins.
+    pub answer_timeout: Duration,
+    /// How long open requests may go on after the server was asked to stop.
+    pub stop_grace: Duration,
+}
+
+impl Default for RequestLimits {
+    fn default() -> Self {
+        RequestLimits {
+            upload_bytes: 64 * GB,
+            small_body_bytes: 256 * 1024,
+            form_fields: 32,
+            uploads_at_once: 16,
+            connections: 1024,
+            head_timeout: Duration::from_secs(30),
+            sender_silence: Duration::from_secs(60),
+            receiver_silence: Duration::from_secs(60),
+            answer_timeout: Duration::from_secs(30),
+            stop_grace: Duration::from_secs(5),
+        }
+    }
+}
+
+/// Limits of jobs.
+#[derive(Clone, Debug)]
+pub struct JobLimits {
+    /// Attempts that may end in an error before the job fails.
+    pub max_failures: i32,
+    /// Attempts that may end with their worker (a crash, a kill, the loss of power) before the job fails.
+    pub max_losses: i32,
+    /// Wait before the second attempt; each further one waits [`JobLimits::RETRY_FACTOR`] times longer.
+    pub retry_base: Duration,
+    /// Longest wait between two attempts.
+    pub retry_max: Duration,
+    /// How often a worker gives a sign of life.
+    pub heartbeat: Duration,
+    /// A worker without a sign of life for this long has lost its lease. Measured on the clock of whoever watches,
+    /// which no one sets, so that a jump of the wall clock ends no lease.
+    pub lease: Duration,
+    /// How often a worker looks whether its job was cancelled.
+    pub cancel_poll: Duration,
+    /// Least time between two writes of progress.
+    pub progress_every: Duration,
+    /// Longest time of one attempt.
+    pub time_limit: Duration,
+    /// Most memory (data segment) of a child process, bytes.
+    pub memory_bytes: u64,
+    /// Longest line that a child may print, bytes; its last one holds the whole manifest.
+    pub line_bytes: usize,
+    /// How much of a child's last words is kept, bytes.
+    pub last_words_bytes: usize,
+    /// Most lines of a job's log.
+    pub log_lines: i64,
+    /// Most lines of one attempt's stderr that go into the log.
+    pub stderr_lines: usize,
+    /// Longest line of a job's log, characters.
+    pub log_line_chars: usize,
+    /// Largest recording segment, bytes.
+    pub segment_bytes: u64,
+    /// Most warnings kept with a job; the manifest has them all.
+    pub warnings: usize,
+}
+
+impl JobLimits {
+    /// How much longer each further wait between attempts is.
+    pub const RETRY_FACTOR: u32 = 4;
+}
+
+impl Default for JobLimits {
+    fn default() -> Self {
+        JobLimits {
+            max_failures: 3,
+            max_losses: 10,
+            retry_base: Duration::from_secs(1),
+            retry_max: Duration::from_secs(300),
+            heartbeat: Duration::from_secs(5),
+            lease: Duration::from_secs(60),
+            cancel_poll: Duration::from_millis(300),
+            progress_every: Duration::from_millis(500),
+            time_limit: Duration::from_secs(12 * 3600),
+            memory_bytes: 8 * GB,
+            line_bytes: 64 * 1024 * 1024,
+            last_words_bytes: 4096,
+            log_lines: 2000,
+            stderr_lines: 200,
+            log_line_chars: 2000,
+            segment_bytes: 256 * 1024 * 1024,
+            warnings: 100,
+        }
+    }
+}

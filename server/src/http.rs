@@ -1,0 +1,129 @@
+//! HTTP: all routes in one list, one file per resource; `http/problem.rs` is the only place of status codes of errors.
+//!
+//! Handlers meet the workers only in the records, the queue and the store.
+
+pub mod connection;
+mod events;
+mod extract;
+mod files;
+mod form;
+mod guard;
+mod health;
+mod ingest;
+mod jobs;
+mod lists;
+mod page;
+mod problem;
+mod recording;
+mod rigs;
+mod runs;
+
+use std::sync::Arc;
+
+use axum::http::Uri;
+use axum::response::Json;
+use axum::routing::get;
+use axum::{Router, middleware};
+use tokio::sync::Semaphore;
+use tokio_util::sync::CancellationToken;
+use tower_http::catch_panic::CatchPanicLayer;
+use utoipa::OpenApi;
+use utoipa_axum::router::OpenApiRouter;
+use utoipa_axum::routes;
+
+use crate::config::Config;
+use crate::error::Error;
+use crate::queue::Queue;
+use crate::runs::Runs;
+use crate::store::Store;
+
+/// What every handler may use.
+#[derive(Clone)]
+pub struct App {
+    /// The records.
+    pub runs: Runs,
+    /// The jobs.
+    pub queue: Queue,
+    /// The files.
+    pub store: Store,
+    /// Limits and folders.
+    pub config: Arc<Config>,
+    /// One permit per upload that may come in at the same time.
+    pub uploads: Arc<Semaphore>,
+    /// The server shall stop: streams end.
+    pub stop: CancellationToken,
+}
+
+/// The part of the OpenAPI document that is not a route.
+#[derive(OpenApi)]
+#[openapi(info(
+    title = "Stria",
+    description = "Runs of robots come in, jobs process them, products go out. Lengths are mm, times RFC 3339 in UTC, \
+                   errors RFC 9457 problem documents. Lists page by `cursor` and `limit`. A creating request with an \
+                   `Idempotency-Key` can be repeated: the same key with the same content is the same result.",
+    license(name = "Apache-2.0")
+))]
+struct Document;
+
+/// Every route of the API. What is not here does not exist.
+fn routes() -> OpenApiRouter<App> {
+    OpenApiRouter::with_openapi(Document::openapi())
+        .routes(routes!(runs::list_runs, ingest::create_run))
+        .routes(routes!(runs::get_run, runs::change_run, runs::delete_run))
+        .routes(routes!(runs::get_source))
+        .routes(routes!(runs::create_job))
+        .routes(routes!(jobs::list_jobs))
+        .routes(routes!(jobs::get_job))
+        .routes(routes!(jobs::cancel_job))
+        .routes(routes!(jobs::retry_job))
+        .routes(routes!(events::stream_events))
+        .routes(routes!(jobs::get_log))
+        .routes(routes!(jobs::list_products))
+        .routes(routes!(jobs::get_product))
+        .routes(routes!(recording::get_recording))
+        .routes(routes!(recording::get_segment))
+        .routes(routes!(jobs::get_archive))
+        .routes(routes!(rigs::list_rigs, rigs::create_rig))
+        .routes(routes!(rigs::get_rig))
+        .routes(routes!(lists::list_assets))
+        .routes(routes!(lists::list_recipes))
+        .routes(routes!(lists::list_options))
+        .routes(routes!(lists::list_workers))
+        .routes(routes!(health::get_livez))
+        .routes(routes!(health::get_readyz))
+}
+
+/// The OpenAPI document, from the same list.
+pub fn openapi() -> utoipa::openapi::OpenApi {
+    let mut document = routes().to_openapi();
+    // The router's way to say "the rest of the path" is not OpenAPI's.
+    let paths = std::mem::take(&mut document.paths.paths);
+    document.paths.paths = paths.into_iter().map(|(path, item)| (path.replace("{*", "{"), item)).collect();
+    document
+}
+
+/// The whole server: API, page, viewer, and what guards them.
+pub fn router(app: App) -> Router {
+    let document = Arc::new(openapi());
+    let (api, _) = routes().split_for_parts();
+    let limits = app.config.requests.clone();
+    api.route("/api/openapi.json", get(move || async move { Json(document.as_ref().clone()) }))
+        .route("/api", get(unknown).post(unknown))
+        .route("/api/{*rest}", axum::routing::any(unknown))
+        .merge(page::routes())
+        .method_not_allowed_fallback(wrong_method)
+        .layer(middleware::from_fn_with_state(app.clone(), guard::answer_in_time))
+        .layer(middleware::from_fn_with_state(app.clone(), guard::own_origin_only))
+        .layer(middleware::map_response(guard::safe_headers))
+        .layer(CatchPanicLayer::custom(problem::after_panic))
+        .layer(axum::extract::DefaultBodyLimit::max(limits.small_body_bytes))
+        .with_state(app)
+}
+
+async fn unknown(uri: Uri) -> Error {
+    Error::NotFound { what: "address", id: uri.path().into() }
+}
+
+async fn wrong_method(method: axum::http::Method, uri: Uri) -> problem::Refusal {
+    problem::Refusal::Method { method: method.to_string(), path: uri.path().into() }
+}

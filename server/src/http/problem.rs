@@ -1,0 +1,141 @@
+//! Errors → HTTP: the only place where an error gets a status code.
+
+use std::any::Any;
+
+use axum::http::header::{CACHE_CONTROL, CONTENT_TYPE, RETRY_AFTER};
+use axum::http::{HeaderValue, StatusCode};
+use axum::response::{IntoResponse, Response};
+
+use crate::error::Error;
+use crate::wire::Problem;
+
+/// Refusals that only HTTP knows.
+#[derive(Debug)]
+pub(super) enum Refusal {
+    /// The path exists, but not with this method.
+    Method { method: String, path: String },
+    /// The body is not of the kind that the route reads.
+    MediaType { found: String, expected: &'static str },
+    /// The asked range lies outside the file.
+    Range { asked: String, bytes: u64 },
+    /// The answer did not begin in time.
+    TooSlow,
+}
+
+impl IntoResponse for Error {
+    fn into_response(self) -> Response {
+        let detail = self.to_string();
+        if self.is_storage_full() {
+            tracing::error!(%detail, "the disk is full");
+            return answer(StatusCode::INSUFFICIENT_STORAGE, "storage-full", "The server's disk is full", detail, true);
+        }
+        match self {
+            Error::NotFound { .. } => {
+                answer(StatusCode::NOT_FOUND, "not-found", "Nothing of that name exists", detail, false)
+            }
+            Error::Input { field, expected, .. } => {
+                let mut problem =
+                    problem(StatusCode::BAD_REQUEST, "bad-input", "The request cannot be used", detail, false);
+                (problem.field, problem.expected) = (field, expected);
+                send(StatusCode::BAD_REQUEST, &problem)
+            }
+            Error::Conflict(_) => {
+                answer(StatusCode::CONFLICT, "conflict", "Its present state does not allow it", detail, false)
+            }
+            Error::KeyReused(_) => {
+                let title = "The idempotency key belongs to another request";
+                answer(StatusCode::UNPROCESSABLE_ENTITY, "key-reused", title, detail, false)
+            }
+            Error::TooLarge { .. } => {
+                answer(StatusCode::PAYLOAD_TOO_LARGE, "too-large", "The request is too large", detail, false)
+            }
+            Error::SenderSilent => {
+                answer(StatusCode::REQUEST_TIMEOUT, "incomplete", "The request did not arrive whole", detail, true)
+            }
+            Error::Busy(_) => {
+                let mut response = answer(StatusCode::SERVICE_UNAVAILABLE, "busy", "The server is busy", detail, true);
+                response.headers_mut().insert(RETRY_AFTER, HeaderValue::from_static("5"));
+                response
+            }
+            Error::Foreign(_) => {
+                answer(StatusCode::FORBIDDEN, "foreign-origin", "The request comes from elsewhere", detail, false)
+            }
+            Error::LeaseLost | Error::Records(_) | Error::Store(_) | Error::Io { .. } | Error::Internal(_) => {
+                // The cause is for the log; what leaves the server names no folder of it.
+                tracing::error!(%detail, "a request failed");
+                internal()
+            }
+        }
+    }
+}
+
+impl IntoResponse for Refusal {
+    fn into_response(self) -> Response {
+        match self {
+            Refusal::Method { method, path } => {
+                let detail = format!("{path} cannot be asked with {method}");
+                answer(StatusCode::METHOD_NOT_ALLOWED, "wrong-method", "The method does not fit", detail, false)
+            }
+            Refusal::MediaType { found, expected } => {
+                let status = StatusCode::UNSUPPORTED_MEDIA_TYPE;
+                let detail = format!("the body's type is {found:?}");
+                let mut problem = problem(status, "wrong-media-type", "The body's type does not fit", detail, false);
+                problem.field = Some("Content-Type".into());
+                problem.expected = Some(expected.into());
+                send(status, &problem)
+            }
+            Refusal::Range { asked, bytes } => {
+                let detail = format!("the range {asked:?} lies outside the file's {bytes} bytes");
+                let mut response = answer(
+                    StatusCode::RANGE_NOT_SATISFIABLE,
+                    "no-such-range",
+                    "There are no such bytes",
+                    detail,
+                    false,
+                );
+                if let Ok(value) = HeaderValue::from_str(&format!("bytes */{bytes}")) {
+                    response.headers_mut().insert(axum::http::header::CONTENT_RANGE, value);
+                }
+                response
+            }
+            Refusal::TooSlow => {
+                let detail = "the server did not answer in time".into();
+                answer(StatusCode::SERVICE_UNAVAILABLE, "too-slow", "The server is busy", detail, true)
+            }
+        }
+    }
+}
+
+/// After a panic in a handler: that request fails, the server goes on.
+pub(super) fn after_panic(panic: Box<dyn Any + Send>) -> Response {
+    let words = panic.downcast_ref::<String>().map(String::as_str).or_else(|| panic.downcast_ref::<&str>().copied());
+    tracing::error!(panic = words.unwrap_or("(no words)"), "a handler panicked");
+    internal()
+}
+
+fn internal() -> Response {
+    let detail = "the server failed; its log says why".into();
+    answer(StatusCode::INTERNAL_SERVER_ERROR, "internal", "The server failed", detail, true)
+}
+
+fn answer(status: StatusCode, kind: &str, title: &str, detail: String, retryable: bool) -> Response {
+    send(status, &problem(status, kind, title, detail, retryable))
+}
+
+fn problem(status: StatusCode, kind: &str, title: &str, detail: String, retryable: bool) -> Problem {
+    Problem {
+        kind: format!("urn:stria:{kind}"),
+        title: title.into(),
+        status: Some(status.as_u16()),
+        detail,
+        field: None,
+        expected: None,
+        retryable,
+    }
+}
+
+fn send(status: StatusCode, problem: &Problem) -> Response {
+    let body = serde_json::to_string(problem).unwrap_or_else(|_| "{}".into());
+    let headers = [(CONTENT_TYPE, "application/problem+json"), (CACHE_CONTROL, "no-store")];
+    (status, headers, body).into_response()
+}

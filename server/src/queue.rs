@@ -1,0 +1,304 @@
+//! Jobs as leased rows: enqueue, claim, cancel, retry; `queue/lease.rs` holds what the owner of a lease may write,
+//! `queue/lost.rs` finds leases whose worker is gone.
+//!
+//! Invariants: a claim and everything that goes with it is one transaction. Every write of a worker carries the
+//! lease's fence, so that a worker that was paused past its lease writes nothing. One transaction publishes exactly
+//! one result. The state of a run's latest job is repeated in the run's row in the same transaction.
+
+mod lease;
+mod lost;
+
+use sea_orm::sea_query::{Expr, LockBehavior, LockType, OnConflict};
+use sea_orm::{
+    ActiveValue::Set, ColumnTrait, Condition, ConnectionTrait, EntityTrait, QueryFilter, QueryOrder, QuerySelect,
+};
+use tokio::sync::watch;
+use uuid::Uuid;
+
+pub use lease::{Lease, Outcome, Progress, PublishedProduct, Signal};
+pub use lost::LeaseWatch;
+
+use crate::config::JobLimits;
+use crate::db::Db;
+use crate::db::tables::{job, run, segment, unpublished};
+use crate::error::{Error, Result};
+use crate::store;
+use crate::wire::time::now_ms;
+use crate::wire::{JobState, Priority};
+
+/// How much earlier (or later) than it came a job counts as having come, ms. Because it is a time, waiting makes up
+/// for it: a batch job that is older than an upload by an hour goes first, so none waits for ever.
+fn rank_ms(created_ms: i64, priority: Priority) -> i64 {
+    const HOUR_MS: i64 = 3_600_000;
+    created_ms
+        + match priority {
+            Priority::Live => -24 * HOUR_MS,
+            Priority::Upload => 0,
+            Priority::Batch => HOUR_MS,
+        }
+}
+
+/// Store keys of an attempt that still runs are due for deletion at no time.
+const HELD_MS: i64 = i64::MAX;
+
+/// Wakes whoever waits for a change in this process. The records are the truth; the bell only saves waiting.
+#[derive(Clone)]
+pub struct Bell(watch::Sender<u64>);
+
+impl Bell {
+    /// A new bell.
+    pub fn new() -> Bell {
+        Bell(watch::Sender::new(0))
+    }
+
+    /// Something changed.
+    pub fn ring(&self) {
+        self.0.send_modify(|n| *n = n.wrapping_add(1));
+    }
+
+    /// Hears every ring from now on, several at once as one.
+    pub fn listen(&self) -> watch::Receiver<u64> {
+        self.0.subscribe()
+    }
+}
+
+impl Default for Bell {
+    fn default() -> Self {
+        Bell::new()
+    }
+}
+
+/// A job to be.
+pub struct NewJob {
+    /// The run.
+    pub run: String,
+    /// Who goes first.
+    pub priority: Priority,
+    /// The rig's name.
+    pub rig_name: String,
+    /// The rig.
+    pub rig_toml: String,
+    /// The recipe's name.
+    pub recipe_name: String,
+    /// The recipe.
+    pub recipe_toml: String,
+}
+
+/// The jobs.
+#[derive(Clone)]
+pub struct Queue {
+    db: Db,
+    bell: Bell,
+    limits: JobLimits,
+}
+
+impl Queue {
+    /// A queue on a database.
+    pub fn new(db: Db, limits: JobLimits) -> Queue {
+        Queue { db, bell: Bell::new(), limits }
+    }
+
+    /// Rings when a job changes.
+    pub fn bell(&self) -> &Bell {
+        &self.bell
+    }
+
+    /// A name for a new run or job: UUID version 7, so that names sort by creation.
+    pub fn new_id() -> String {
+        Uuid::now_v7().to_string()
+    }
+
+    /// Adds a job inside the caller's transaction; the caller rings the bell after its commit.
+    pub async fn enqueue(&self, records: &impl ConnectionTrait, new: NewJob) -> Result<String> {
+        let (id, now) = (Queue::new_id(), now_ms());
+        let row = job::ActiveModel {
+            id: Set(id.clone()),
+            run_id: Set(new.run.clone()),
+            created_ms: Set(now),
+            priority: Set(new.priority.as_str().into()),
+            rank_ms: Set(rank_ms(now, new.priority)),
+            rig_name: Set(new.rig_name),
+            rig_toml: Set(new.rig_toml),
+            recipe_name: Set(new.recipe_name),
+            recipe_toml: Set(new.recipe_toml),
+            state: Set(JobState::Queued.as_str().into()),
+            cancel_requested: Set(0),
+            not_before_ms: Set(0),
+            fence: Set(0),
+            attempt: Set(0),
+            failures: Set(0),
+            losses: Set(0),
+            node: Set(String::new()),
+            worker: Set(String::new()),
+            beat: Set(0),
+            stage: Set(String::new()),
+            fraction: Set(0.0),
+            frames: Set(0),
+            frames_total: Set(None),
+            frames_per_s: Set(0.0),
+            time_left_s: Set(None),
+            warnings: Set("[]".into()),
+            error: Set(None),
+            quality: Set(None),
+            result_fence: Set(None),
+            started_ms: Set(None),
+            finished_ms: Set(None),
+        };
+        job::Entity::insert(row).exec_without_returning(records).await?;
+        run::Entity::update_many()
+            .col_expr(run::Column::LatestJob, Expr::value(id.as_str()))
+            .col_expr(run::Column::State, Expr::value(JobState::Queued.as_str()))
+            .filter(run::Column::Id.eq(new.run))
+            .exec(records)
+            .await?;
+        Ok(id)
+    }
+
+    /// Takes the next job, if there is one: counts the attempt, raises the fence, clears what an earlier attempt left.
+    pub async fn claim(&self, node: &str, worker: &str) -> Result<Option<Lease>> {
+        // Looking first keeps idle workers from taking the write lock again and again.
+        if self.next_ready(self.db.read(), false).await?.is_none() {
+            return Ok(None);
+        }
+        let t = self.db.write().await?;
+        let Some(next) = self.next_ready(&*t, true).await? else { return Ok(None) };
+        let Some(run) = run::Entity::find_by_id(&next.run_id).one(&*t).await? else {
+            return Err(Error::Internal(format!("job {} has no run", next.id)));
+        };
+        let (fence, attempt) = (next.fence + 1, next.attempt + 1);
+        job::Entity::update_many()
+            .set(job::ActiveModel {
+                state: Set(JobState::Running.as_str().into()),
+                fence: Set(fence),
+                attempt: Set(attempt),
+                node: Set(node.into()),
+                worker: Set(worker.into()),
+                beat: Set(next.beat + 1),
+                cancel_requested: Set(0),
+                stage: Set(String::new()),
+                fraction: Set(0.0),
+                frames: Set(0),
+                frames_total: Set(None),
+                frames_per_s: Set(0.0),
+                time_left_s: Set(None),
+                warnings: Set("[]".into()),
+                error: Set(None),
+                started_ms: Set(Some(now_ms())),
+                finished_ms: Set(None),
+                ..Default::default()
+            })
+            .filter(job::Column::Id.eq(&next.id))
+            .exec(&*t)
+            .await?;
+        segment::Entity::delete_many().filter(segment::Column::JobId.eq(&next.id)).exec(&*t).await?;
+        mark_unpublished(&*t, store::attempt_prefix(&next.id, fence), HELD_MS).await?;
+        repeat_in_run(&*t, &next.id, JobState::Running).await?;
+        t.commit().await?;
+        self.bell.ring();
+        Ok(Some(Lease::new(next, run, fence, attempt)))
+    }
+
+    /// The queued job that goes next.
+    async fn next_ready(&self, records: &impl ConnectionTrait, to_take: bool) -> Result<Option<job::Model>> {
+        let now = now_ms();
+        // A wait further off than any that we set means that the clock was set back: it must not park a job.
+        let horizon = now + 2 * self.limits.retry_max.as_millis() as i64;
+        let ready = Condition::any().add(job::Column::NotBeforeMs.lte(now)).add(job::Column::NotBeforeMs.gt(horizon));
+        let mut query = job::Entity::find()
+            .filter(job::Column::State.eq(JobState::Queued.as_str()))
+            .filter(ready)
+            .order_by_asc(job::Column::RankMs)
+            .order_by_asc(job::Column::Id);
+        if to_take {
+            // PostgreSQL: each worker another row. SQLite has no such words; its transaction is alone anyway.
+            query = query.lock_with_behavior(LockType::Update, LockBehavior::SkipLocked);
+        }
+        Ok(query.one(records).await?)
+    }
+
+    /// Asks a job to stop. A waiting one is cancelled at once, a running one when its worker hears of it.
+    pub async fn cancel(&self, id: &str) -> Result<()> {
+        let t = self.db.write().await?;
+        let found = find(&*t, id).await?;
+        match state_of(&found)? {
+            JobState::Queued => {
+                let change = job::ActiveModel {
+                    state: Set(JobState::Cancelled.as_str().into()),
+                    finished_ms: Set(Some(now_ms())),
+                    ..Default::default()
+                };
+                job::Entity::update_many().set(change).filter(job::Column::Id.eq(id)).exec(&*t).await?;
+                repeat_in_run(&*t, id, JobState::Cancelled).await?;
+            }
+            JobState::Running => {
+                let change = job::ActiveModel { cancel_requested: Set(1), ..Default::default() };
+                job::Entity::update_many().set(change).filter(job::Column::Id.eq(id)).exec(&*t).await?;
+            }
+            JobState::Cancelled => {}
+            ended => return Err(Error::Conflict(format!("the job is {} and cannot be cancelled", ended.as_str()))),
+        }
+        t.commit().await?;
+        self.bell.ring();
+        Ok(())
+    }
+
+    /// Puts a failed or cancelled job back to the queue, with all its attempts before it.
+    pub async fn retry(&self, id: &str) -> Result<()> {
+        let t = self.db.write().await?;
+        let found = find(&*t, id).await?;
+        match state_of(&found)? {
+            JobState::Failed | JobState::Cancelled => {}
+            other => {
+                let what = format!("the job is {}; only a failed or cancelled one can be tried again", other.as_str());
+                return Err(Error::Conflict(what));
+            }
+        }
+        let change = job::ActiveModel {
+            state: Set(JobState::Queued.as_str().into()),
+            failures: Set(0),
+            losses: Set(0),
+            not_before_ms: Set(0),
+            cancel_requested: Set(0),
+            stage: Set(String::new()),
+            fraction: Set(0.0),
+            error: Set(None),
+            finished_ms: Set(None),
+            ..Default::default()
+        };
+        job::Entity::update_many().set(change).filter(job::Column::Id.eq(id)).exec(&*t).await?;
+        repeat_in_run(&*t, id, JobState::Queued).await?;
+        t.commit().await?;
+        self.bell.ring();
+        Ok(())
+    }
+}
+
+/// The state in a row.
+pub fn state_of(row: &job::Model) -> Result<JobState> {
+    JobState::parse(&row.state).ok_or_else(|| Error::Internal(format!("job {} has the state '{}'", row.id, row.state)))
+}
+
+/// Store keys under the prefix will be deleted at `due_ms`, unless they are published before.
+pub async fn mark_unpublished(records: &impl ConnectionTrait, prefix: String, due_ms: i64) -> Result<()> {
+    let row = unpublished::ActiveModel { prefix: Set(prefix), due_ms: Set(due_ms) };
+    let replace = OnConflict::column(unpublished::Column::Prefix).update_column(unpublished::Column::DueMs).to_owned();
+    unpublished::Entity::insert(row).on_conflict(replace).exec_without_returning(records).await?;
+    Ok(())
+}
+
+async fn find(records: &impl ConnectionTrait, id: &str) -> Result<job::Model> {
+    let found = job::Entity::find_by_id(id).one(records).await?;
+    found.ok_or_else(|| Error::NotFound { what: "job", id: id.into() })
+}
+
+async fn repeat_in_run(records: &impl ConnectionTrait, job: &str, state: JobState) -> Result<()> {
+    run::Entity::update_many()
+        .col_expr(run::Column::State, Expr::value(state.as_str()))
+        .filter(run::Column::LatestJob.eq(job))
+        .exec(records)
+        .await?;
+    Ok(())
+}
+
+#[cfg(test)]
+mod tests;

@@ -1,0 +1,377 @@
+//! What the owner of a lease may write: signs of life, progress, segments, log lines, and one end.
+
+use sea_orm::sea_query::Expr;
+use sea_orm::{
+    ActiveValue::Set, ColumnTrait, Condition, ConnectionTrait, EntityTrait, ExprTrait, PaginatorTrait, QueryFilter,
+    QuerySelect,
+};
+use uuid::Uuid;
+
+use super::{Queue, mark_unpublished, repeat_in_run};
+use crate::config::JobLimits;
+use crate::db::tables::{job, log_line, product, run, segment, unpublished};
+use crate::error::{Error, Result};
+use crate::store::{self, Facts, ProductName};
+use crate::wire::child::Failure;
+use crate::wire::time::now_ms;
+use crate::wire::{JobState, Problem};
+
+/// Rows of one INSERT; SQLite takes 32,766 values.
+const ROWS_AT_ONCE: usize = 1000;
+
+/// The right to work at a job, and what is needed for it.
+#[derive(Clone, Debug)]
+pub struct Lease {
+    /// The job.
+    pub job: String,
+    /// The run.
+    pub run: String,
+    /// Grows with every claim; part of every write and of every store key of this attempt.
+    pub fence: i64,
+    /// Which try this is, from 1.
+    pub attempt: i32,
+    /// The rig.
+    pub rig_toml: String,
+    /// The recipe.
+    pub recipe_toml: String,
+    /// The source's own name.
+    pub filename: String,
+    /// The extension of the source's key.
+    pub source_extension: String,
+    /// Frames a second, where the sender said so.
+    pub fps: Option<f64>,
+    /// When the run was recorded, ms since 1970.
+    pub recorded_ms: i64,
+}
+
+impl Lease {
+    pub(super) fn new(job: job::Model, run: run::Model, fence: i64, attempt: i32) -> Lease {
+        Lease {
+            job: job.id,
+            run: run.id,
+            fence,
+            attempt,
+            rig_toml: job.rig_toml,
+            recipe_toml: job.recipe_toml,
+            filename: run.filename,
+            source_extension: run.source_extension,
+            fps: run.fps,
+            recorded_ms: run.recorded_ms,
+        }
+    }
+
+    /// The row, as long as the lease holds.
+    fn held(&self) -> Condition {
+        Condition::all()
+            .add(job::Column::Id.eq(&self.job))
+            .add(job::Column::Fence.eq(self.fence))
+            .add(job::Column::State.eq(JobState::Running.as_str()))
+    }
+}
+
+/// What the records say to a worker.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub enum Signal {
+    /// Go on.
+    Continue,
+    /// Someone asked for the job to stop.
+    Cancel,
+    /// The job is another's now, or gone.
+    Lost,
+}
+
+/// How far an attempt is.
+#[derive(Clone, Debug, Default, PartialEq)]
+pub struct Progress {
+    /// `measuring`, or the product being written.
+    pub stage: String,
+    /// 0 to 1 over the whole job.
+    pub fraction: f64,
+    /// Frames done.
+    pub frames: u64,
+    /// Frames in all, where known.
+    pub frames_total: Option<u64>,
+    /// Frames a second.
+    pub frames_per_s: f64,
+    /// Time left, s, where it can be told.
+    pub time_left_s: Option<f64>,
+}
+
+/// A product that lies in the store.
+#[derive(Clone, Debug)]
+pub struct PublishedProduct {
+    /// Its name.
+    pub name: ProductName,
+    /// Its size and hash.
+    pub facts: Facts,
+}
+
+/// What an attempt made.
+#[derive(Clone, Debug)]
+pub struct Outcome {
+    /// The files, in the order in which they shall be listed.
+    pub products: Vec<PublishedProduct>,
+    /// What a person should know.
+    pub warnings: Vec<String>,
+    /// Quality figures.
+    pub quality: serde_json::Value,
+    /// Frames read.
+    pub frames: u64,
+}
+
+impl Queue {
+    /// A sign of life.
+    pub async fn beat(&self, lease: &Lease) -> Result<()> {
+        let change = job::Entity::update_many().col_expr(job::Column::Beat, Expr::col(job::Column::Beat).add(1));
+        let t = self.db.write().await?;
+        must_hold(change.filter(lease.held()).exec(&*t).await?.rows_affected)?;
+        t.commit().await
+    }
+
+    /// Whether to go on.
+    pub async fn signal(&self, lease: &Lease) -> Result<Signal> {
+        let asked: Option<i32> = job::Entity::find()
+            .select_only()
+            .column(job::Column::CancelRequested)
+            .filter(lease.held())
+            .into_tuple()
+            .one(self.db.read())
+            .await?;
+        Ok(match asked {
+            None => Signal::Lost,
+            Some(0) => Signal::Continue,
+            Some(_) => Signal::Cancel,
+        })
+    }
+
+    /// Writes how far the attempt is; also a sign of life.
+    pub async fn progress(&self, lease: &Lease, progress: &Progress) -> Result<()> {
+        let change = job::ActiveModel {
+            stage: Set(progress.stage.clone()),
+            fraction: Set(progress.fraction.clamp(0.0, 1.0)),
+            frames: Set(to_i64(progress.frames)),
+            frames_total: Set(progress.frames_total.map(to_i64)),
+            frames_per_s: Set(progress.frames_per_s),
+            time_left_s: Set(progress.time_left_s),
+            ..Default::default()
+        };
+        let change = job::Entity::update_many()
+            .set(change)
+            .col_expr(job::Column::Beat, Expr::col(job::Column::Beat).add(1))
+            .filter(lease.held());
+        let t = self.db.write().await?;
+        must_hold(change.exec(&*t).await?.rows_affected)?;
+        t.commit().await?;
+        self.bell.ring();
+        Ok(())
+    }
+
+    /// A recording segment lies in the store.
+    pub async fn segment(&self, lease: &Lease, number: u32, facts: &Facts) -> Result<()> {
+        let t = self.db.write().await?;
+        lease_holds(&*t, lease).await?;
+        let row = segment::ActiveModel {
+            job_id: Set(lease.job.clone()),
+            number: Set(number.into()),
+            fence: Set(lease.fence),
+            bytes: Set(to_i64(facts.bytes)),
+            sha256: Set(facts.sha256.clone()),
+        };
+        segment::Entity::insert(row).exec_without_returning(&*t).await?;
+        t.commit().await?;
+        self.bell.ring();
+        Ok(())
+    }
+
+    /// Adds a line to the job's log; past the log's length lines are dropped.
+    pub async fn log(&self, lease: &Lease, text: &str) -> Result<()> {
+        let t = self.db.write().await?;
+        lease_holds(&*t, lease).await?;
+        add_log_line(&*t, &lease.job, lease.attempt, text, &self.limits).await?;
+        t.commit().await?;
+        self.bell.ring();
+        Ok(())
+    }
+
+    /// Publishes the result: state, products and the right to keep their files, at once.
+    pub async fn finish(&self, lease: &Lease, outcome: Outcome) -> Result<()> {
+        let t = self.db.write().await?;
+        let warnings: Vec<_> = outcome.warnings.into_iter().take(self.limits.warnings).collect();
+        let change = job::ActiveModel {
+            stage: Set(String::new()),
+            fraction: Set(1.0),
+            frames: Set(to_i64(outcome.frames)),
+            frames_total: Set(Some(to_i64(outcome.frames))),
+            time_left_s: Set(None),
+            warnings: Set(serde_json::Value::from(warnings).to_string()),
+            quality: Set(Some(outcome.quality.to_string())),
+            result_fence: Set(Some(lease.fence)),
+            ..ended(JobState::Done)
+        };
+        must_hold(job::Entity::update_many().set(change).filter(lease.held()).exec(&*t).await?.rows_affected)?;
+        let rows = outcome.products.into_iter().enumerate().map(|(i, p)| product::ActiveModel {
+            job_id: Set(lease.job.clone()),
+            name: Set(p.name.as_str().into()),
+            position: Set(i as i64),
+            bytes: Set(to_i64(p.facts.bytes)),
+            sha256: Set(p.facts.sha256),
+        });
+        let rows = rows.collect::<Vec<_>>();
+        for part in rows.chunks(ROWS_AT_ONCE) {
+            product::Entity::insert_many(part.iter().cloned()).exec_without_returning(&*t).await?;
+        }
+        unpublished::Entity::delete_by_id(store::attempt_prefix(&lease.job, lease.fence)).exec(&*t).await?;
+        repeat_in_run(&*t, &lease.job, JobState::Done).await?;
+        t.commit().await?;
+        self.bell.ring();
+        Ok(())
+    }
+
+    /// The attempt ended in an error: back to the queue after a wait, or the job's end.
+    pub async fn fail(&self, lease: &Lease, failure: &Failure) -> Result<()> {
+        let t = self.db.write().await?;
+        let row = lease_holds(&*t, lease).await?;
+        let failures = row.failures + 1;
+        let again = failure.retryable && failures < self.limits.max_failures;
+        let change = job::ActiveModel {
+            failures: Set(failures),
+            error: Set(Some(problem_of(failure, again)?)),
+            not_before_ms: Set(now_ms() + wait_ms(&self.limits, failures)),
+            ..if again { requeued() } else { ended(JobState::Failed) }
+        };
+        let then = if again { "it will be tried again" } else { "it will not be tried again" };
+        let line = format!("attempt {} failed ({}): {}; {then}", lease.attempt, failure.kind, failure.message);
+        add_log_line(&*t, &lease.job, lease.attempt, &line, &self.limits).await?;
+        self.leave(&*t, lease, change, if again { JobState::Queued } else { JobState::Failed }).await?;
+        t.commit().await?;
+        self.bell.ring();
+        Ok(())
+    }
+
+    /// The attempt stopped because someone asked for it.
+    pub async fn cancelled(&self, lease: &Lease) -> Result<()> {
+        let t = self.db.write().await?;
+        lease_holds(&*t, lease).await?;
+        self.leave(&*t, lease, ended(JobState::Cancelled), JobState::Cancelled).await?;
+        t.commit().await?;
+        self.bell.ring();
+        Ok(())
+    }
+
+    /// The worker stops cleanly: back to the queue, and the attempt is not counted.
+    pub async fn release(&self, lease: &Lease) -> Result<()> {
+        let t = self.db.write().await?;
+        let row = lease_holds(&*t, lease).await?;
+        let change = job::ActiveModel { attempt: Set(row.attempt - 1), not_before_ms: Set(0), ..requeued() };
+        self.leave(&*t, lease, change, JobState::Queued).await?;
+        t.commit().await?;
+        self.bell.ring();
+        Ok(())
+    }
+
+    /// What all ends without a result have in common.
+    async fn leave(
+        &self,
+        records: &impl ConnectionTrait,
+        lease: &Lease,
+        change: job::ActiveModel,
+        state: JobState,
+    ) -> Result<()> {
+        must_hold(job::Entity::update_many().set(change).filter(lease.held()).exec(records).await?.rows_affected)?;
+        segment::Entity::delete_many().filter(segment::Column::JobId.eq(&lease.job)).exec(records).await?;
+        mark_unpublished(records, store::attempt_prefix(&lease.job, lease.fence), now_ms()).await?;
+        repeat_in_run(records, &lease.job, state).await
+    }
+}
+
+/// Columns of a job that goes back to the queue.
+pub(super) fn requeued() -> job::ActiveModel {
+    job::ActiveModel {
+        state: Set(JobState::Queued.as_str().into()),
+        stage: Set(String::new()),
+        fraction: Set(0.0),
+        frames: Set(0),
+        frames_per_s: Set(0.0),
+        time_left_s: Set(None),
+        cancel_requested: Set(0),
+        ..Default::default()
+    }
+}
+
+/// Columns of a job that ends.
+pub(super) fn ended(state: JobState) -> job::ActiveModel {
+    job::ActiveModel {
+        state: Set(state.as_str().into()),
+        cancel_requested: Set(0),
+        time_left_s: Set(None),
+        finished_ms: Set(Some(now_ms())),
+        ..Default::default()
+    }
+}
+
+/// The failure as the job's record keeps it.
+pub(super) fn problem_of(failure: &Failure, again: bool) -> Result<String> {
+    let title = match failure.kind.as_str() {
+        "bad_input" => "The run cannot be processed as it is",
+        "killed" => "The processing was killed",
+        "time_limit" => "The processing took too long",
+        "lost" => "The worker was lost",
+        "io" => "A file could not be read or written",
+        _ => "The processing failed",
+    };
+    let problem = Problem {
+        kind: format!("urn:stria:job:{}", failure.kind),
+        title: title.into(),
+        status: None,
+        detail: failure.message.clone(),
+        field: failure.field.clone(),
+        expected: failure.expected.clone(),
+        retryable: again,
+    };
+    serde_json::to_string(&problem).map_err(|e| Error::Internal(format!("a problem is not JSON: {e}")))
+}
+
+/// The wait before the next attempt: longer each time, and never the same for many jobs at once.
+pub(super) fn wait_ms(limits: &JobLimits, failures: i32) -> i64 {
+    let exponent = u32::try_from(failures - 1).unwrap_or(0);
+    let factor = JobLimits::RETRY_FACTOR.saturating_pow(exponent);
+    let wait = limits.retry_base.saturating_mul(factor).min(limits.retry_max).as_millis() as i64;
+    // Up to a quarter more; the last bits of a UUID are random.
+    let random = (Uuid::now_v7().as_u128() & 0xffff) as i64;
+    wait + wait * random / (4 * 0x10000)
+}
+
+pub(super) async fn add_log_line(
+    records: &impl ConnectionTrait,
+    job: &str,
+    attempt: i32,
+    text: &str,
+    limits: &JobLimits,
+) -> Result<()> {
+    let number = log_line::Entity::find().filter(log_line::Column::JobId.eq(job)).count(records).await?;
+    let number = to_i64(number);
+    if number >= limits.log_lines {
+        return Ok(());
+    }
+    let row = log_line::ActiveModel {
+        job_id: Set(job.into()),
+        number: Set(number),
+        at_ms: Set(now_ms()),
+        attempt: Set(attempt),
+        line: Set(text.chars().take(limits.log_line_chars).collect()),
+    };
+    log_line::Entity::insert(row).exec_without_returning(records).await?;
+    Ok(())
+}
+
+async fn lease_holds(records: &impl ConnectionTrait, lease: &Lease) -> Result<job::Model> {
+    job::Entity::find().filter(lease.held()).one(records).await?.ok_or(Error::LeaseLost)
+}
+
+fn must_hold(rows: u64) -> Result<()> {
+    if rows == 0 { Err(Error::LeaseLost) } else { Ok(()) }
+}
+
+fn to_i64(value: u64) -> i64 {
+    i64::try_from(value).unwrap_or(i64::MAX)
+}

@@ -1,0 +1,382 @@
+//! The records of runs: come in, be listed, changed, processed again, deleted. `runs/rigs.rs` keeps rigs and recipes,
+//! `runs/jobs.rs` reads jobs and what belongs to them, `runs/listing.rs` pages and filters.
+
+mod jobs;
+mod listing;
+mod rigs;
+
+use sea_orm::sea_query::OnConflict;
+use sea_orm::{ActiveValue::Set, ColumnTrait, ConnectionTrait, EntityTrait, QueryFilter};
+
+pub use jobs::content_type;
+pub use listing::{Page, RunFilter};
+pub use rigs::{RecipeText, RigText, built_in_recipes, options};
+
+use crate::db::Db;
+use crate::db::tables::{asset, idempotency_key, job, log_line, product, run, segment, unpublished};
+use crate::error::{Error, Result};
+use crate::incoming::Incoming;
+use crate::queue::{self, NewJob, Queue};
+use crate::store::{self, Facts, Key, Store};
+use crate::wire::time::{from_text, now_ms, to_text};
+use crate::wire::{self, Direction, JobState, Priority, RunChange};
+
+/// Longest name of an asset, a rig or a file, and longest note, characters.
+pub const MAX_NAME_CHARS: usize = 200;
+/// Longest note, characters.
+pub const MAX_NOTE_CHARS: usize = 4000;
+/// Chainage is given within ± this, mm: 100,000 km.
+const MAX_CHAINAGE_MM: f64 = 1e11;
+
+/// How long an upload may lie in the store before its record is written.
+const UNRECORDED_MS: i64 = 3_600_000;
+/// How long the files of a deleted run that is being processed are left to its worker.
+const STOPPING_MS: i64 = 30_000;
+
+/// What is known about a run when it comes in.
+#[derive(Clone, Debug)]
+pub struct NewRun {
+    /// The pipe or wall.
+    pub asset: String,
+    /// Chainage of the first frame, mm.
+    pub chainage_mm: f64,
+    /// Which way the robot went.
+    pub direction: Direction,
+    /// When it was recorded, ms since 1970; `None`: now.
+    pub recorded_ms: Option<i64>,
+    /// Words for people.
+    pub note: String,
+    /// The file's own name.
+    pub filename: String,
+    /// Frames a second of the source, where it does not say so itself.
+    pub fps: Option<f64>,
+    /// The rig.
+    pub rig: RigText,
+    /// The recipe.
+    pub recipe: RecipeText,
+}
+
+impl NewRun {
+    /// Every value within its limits, or the first that is not.
+    pub fn check(&self) -> Result<()> {
+        check_name("asset", &self.asset)?;
+        check_chainage(self.chainage_mm)?;
+        check_note(&self.note)?;
+        if let Some(fps) = self.fps
+            && !(fps > 0.0 && fps <= 10_000.0)
+        {
+            return Err(Error::field("fps", format!("fps is {fps}"), "more than 0, at most 10,000 frames a second"));
+        }
+        Ok(())
+    }
+
+    /// The same content gives the same text; times of arrival do not count.
+    fn fingerprint(&self, source: &Facts) -> String {
+        let parts = (&self.asset, self.chainage_mm.to_bits(), self.direction.as_str(), self.recorded_ms, &self.note);
+        let more = (&self.filename, self.fps.map(f64::to_bits), &self.rig.toml, &self.recipe.toml, &source.sha256);
+        store::sha256_of(&format!("run {parts:?} {more:?}"))
+    }
+}
+
+/// A run that a request made, or had made before.
+pub struct Created<T> {
+    /// What was made.
+    pub made: T,
+    /// True where the same request had made it before.
+    pub repeated: bool,
+}
+
+/// A run's images, to be sent back.
+pub struct SourceFile {
+    /// Where they lie.
+    pub key: Key,
+    /// Size and hash.
+    pub facts: Facts,
+    /// The file's own name.
+    pub filename: String,
+}
+
+/// The records.
+#[derive(Clone)]
+pub struct Runs {
+    db: Db,
+    queue: Queue,
+    store: Store,
+}
+
+impl Runs {
+    /// On a database, with the queue and the store that belong to it.
+    pub fn new(db: Db, queue: Queue, store: Store) -> Runs {
+        Runs { db, queue, store }
+    }
+
+    /// The records answer.
+    pub async fn ping(&self) -> Result<()> {
+        Ok(self.db.read().execute_unprepared("SELECT 1").await.map(|_| ())?)
+    }
+
+    /// A whole upload becomes a run with one job. The file goes into the store first, under a key that is marked for
+    /// deletion; the transaction that writes the records takes the mark away.
+    pub async fn create(&self, new: NewRun, incoming: Incoming, key: Option<&str>) -> Result<Created<wire::Run>> {
+        new.check()?;
+        let fingerprint = new.fingerprint(&incoming.facts);
+        if let Some(job) = self.made_before(self.db.read(), key, &fingerprint).await? {
+            return Ok(Created { made: self.get(&job.run_id).await?, repeated: true });
+        }
+        let run = Queue::new_id();
+        let extension = store::plain_extension(&new.filename);
+        let prefix = store::run_prefix(&run);
+        let t = self.db.write().await?;
+        queue::mark_unpublished(&*t, prefix.clone(), now_ms() + UNRECORDED_MS).await?;
+        t.commit().await?;
+        self.store.take_file(&incoming.file, &Key::source(&run, &extension)).await?;
+        self.store.sync().await?;
+
+        let t = self.db.write().await?;
+        if let Some(job) = self.made_before(&*t, key, &fingerprint).await? {
+            // The same request came twice at the same time, and the other one was first.
+            queue::mark_unpublished(&*t, prefix, now_ms()).await?;
+            t.commit().await?;
+            return Ok(Created { made: self.get(&job.run_id).await?, repeated: true });
+        }
+        insert_asset(&*t, &new.asset).await?;
+        rigs::keep_if_new(&*t, &new.rig).await?;
+        let now = now_ms();
+        let row = run::ActiveModel {
+            id: Set(run.clone()),
+            created_ms: Set(now),
+            asset: Set(new.asset),
+            chainage_mm: Set(new.chainage_mm),
+            direction: Set(new.direction.as_str().into()),
+            recorded_ms: Set(new.recorded_ms.unwrap_or(now)),
+            note: Set(new.note),
+            filename: Set(new.filename),
+            source_extension: Set(extension),
+            source_bytes: Set(to_i64(incoming.facts.bytes)),
+            source_sha256: Set(incoming.facts.sha256.clone()),
+            fps: Set(new.fps),
+            rig_name: Set(new.rig.name.clone()),
+            state: Set(JobState::Queued.as_str().into()),
+            latest_job: Set(String::new()),
+        };
+        run::Entity::insert(row).exec_without_returning(&*t).await?;
+        let job = NewJob {
+            run: run.clone(),
+            priority: Priority::Upload,
+            rig_name: new.rig.name,
+            rig_toml: new.rig.toml,
+            recipe_name: new.recipe.name,
+            recipe_toml: new.recipe.toml,
+        };
+        let job = self.queue.enqueue(&*t, job).await?;
+        remember(&*t, key, fingerprint, &job).await?;
+        unpublished::Entity::delete_by_id(prefix).exec(&*t).await?;
+        t.commit().await?;
+        self.queue.bell().ring();
+        Ok(Created { made: self.get(&run).await?, repeated: false })
+    }
+
+    /// Processes a run again: what is not said stays as in its latest job.
+    pub async fn reprocess(
+        &self,
+        run_id: &str,
+        rig: Option<RigText>,
+        recipe: Option<RecipeText>,
+        priority: Priority,
+        key: Option<&str>,
+    ) -> Result<Created<wire::Job>> {
+        let t = self.db.write().await?;
+        let row = self.row(&*t, run_id).await?;
+        let Some(latest) = job::Entity::find_by_id(&row.latest_job).one(&*t).await? else {
+            return Err(Error::Internal(format!("run {run_id} has no job")));
+        };
+        let rig = rig.unwrap_or(RigText { name: latest.rig_name, toml: latest.rig_toml });
+        let recipe = recipe.unwrap_or(RecipeText { name: latest.recipe_name, toml: latest.recipe_toml });
+        let what = format!("job {run_id} {:?} {:?} {}", rig.toml, recipe.toml, priority.as_str());
+        let fingerprint = store::sha256_of(&what);
+        if let Some(job) = self.made_before(&*t, key, &fingerprint).await? {
+            return Ok(Created { made: self.job(&job.id).await?, repeated: true });
+        }
+        rigs::keep_if_new(&*t, &rig).await?;
+        let new = NewJob {
+            run: run_id.into(),
+            priority,
+            rig_name: rig.name,
+            rig_toml: rig.toml,
+            recipe_name: recipe.name,
+            recipe_toml: recipe.toml,
+        };
+        let job = self.queue.enqueue(&*t, new).await?;
+        remember(&*t, key, fingerprint, &job).await?;
+        t.commit().await?;
+        self.queue.bell().ring();
+        Ok(Created { made: self.job(&job).await?, repeated: false })
+    }
+
+    /// A run with its latest job.
+    pub async fn get(&self, id: &str) -> Result<wire::Run> {
+        let row = self.row(self.db.read(), id).await?;
+        let latest = job::Entity::find_by_id(&row.latest_job).one(self.db.read()).await?;
+        listing::run_of(row, latest)
+    }
+
+    /// A run's images.
+    pub async fn source(&self, id: &str) -> Result<SourceFile> {
+        let row = self.row(self.db.read(), id).await?;
+        let facts = Facts { bytes: to_u64(row.source_bytes), sha256: row.source_sha256 };
+        Ok(SourceFile { key: Key::source(&row.id, &row.source_extension), facts, filename: row.filename })
+    }
+
+    /// Changes what is said about a run.
+    pub async fn change(&self, id: &str, change: RunChange) -> Result<wire::Run> {
+        let t = self.db.write().await?;
+        let row = self.row(&*t, id).await?;
+        let mut set = run::ActiveModel { id: Set(row.id), note: Set(row.note), ..Default::default() };
+        if let Some(name) = change.asset {
+            let name = name.trim().to_string();
+            check_name("asset", &name)?;
+            insert_asset(&*t, &name).await?;
+            set.asset = Set(name);
+        }
+        if let Some(chainage_mm) = change.chainage_mm {
+            check_chainage(chainage_mm)?;
+            set.chainage_mm = Set(chainage_mm);
+        }
+        if let Some(direction) = change.direction {
+            set.direction = Set(direction.as_str().into());
+        }
+        if let Some(text) = change.recorded_at {
+            set.recorded_ms = Set(read_time("recorded_at", &text)?);
+        }
+        if let Some(note) = change.note {
+            check_note(&note)?;
+            set.note = Set(note);
+        }
+        run::Entity::update_many().set(set).filter(run::Column::Id.eq(id)).exec(&*t).await?;
+        self.forget_asset_without_runs(&*t, &row.asset).await?;
+        t.commit().await?;
+        self.queue.bell().ring();
+        self.get(id).await
+    }
+
+    /// Deletes a run with its jobs and all their files. A worker that is at one of them loses its lease and stops.
+    pub async fn delete(&self, id: &str) -> Result<()> {
+        let t = self.db.write().await?;
+        let row = self.row(&*t, id).await?;
+        for job in job::Entity::find().filter(job::Column::RunId.eq(id)).all(&*t).await? {
+            let running = queue::state_of(&job)? == JobState::Running;
+            let due_ms = now_ms() + if running { STOPPING_MS } else { 0 };
+            queue::mark_unpublished(&*t, store::job_prefix(&job.id), due_ms).await?;
+            product::Entity::delete_many().filter(product::Column::JobId.eq(&job.id)).exec(&*t).await?;
+            segment::Entity::delete_many().filter(segment::Column::JobId.eq(&job.id)).exec(&*t).await?;
+            log_line::Entity::delete_many().filter(log_line::Column::JobId.eq(&job.id)).exec(&*t).await?;
+            let attempts = unpublished::Column::Prefix.starts_with(store::job_prefix(&job.id));
+            let parts = unpublished::Column::Prefix.ne(store::job_prefix(&job.id));
+            unpublished::Entity::delete_many().filter(attempts).filter(parts).exec(&*t).await?;
+        }
+        queue::mark_unpublished(&*t, store::run_prefix(id), now_ms()).await?;
+        run::Entity::delete_by_id(&row.id).exec(&*t).await?;
+        self.forget_asset_without_runs(&*t, &row.asset).await?;
+        t.commit().await?;
+        self.queue.bell().ring();
+        Ok(())
+    }
+
+    async fn forget_asset_without_runs(&self, records: &impl ConnectionTrait, name: &str) -> Result<()> {
+        let left = run::Entity::find().filter(run::Column::Asset.eq(name)).one(records).await?;
+        if left.is_none() {
+            asset::Entity::delete_by_id(name).exec(records).await?;
+        }
+        Ok(())
+    }
+
+    async fn row(&self, records: &impl ConnectionTrait, id: &str) -> Result<run::Model> {
+        let found = run::Entity::find_by_id(id).one(records).await?;
+        found.ok_or_else(|| Error::NotFound { what: "run", id: id.into() })
+    }
+
+    /// The job that an earlier request with the same key and content made.
+    async fn made_before(
+        &self,
+        records: &impl ConnectionTrait,
+        key: Option<&str>,
+        fingerprint: &str,
+    ) -> Result<Option<job::Model>> {
+        let Some(key) = key else { return Ok(None) };
+        let Some(row) = idempotency_key::Entity::find_by_id(key).one(records).await? else { return Ok(None) };
+        if row.fingerprint != fingerprint {
+            return Err(Error::KeyReused(key.into()));
+        }
+        Ok(job::Entity::find_by_id(row.job_id).one(records).await?)
+    }
+}
+
+async fn remember(records: &impl ConnectionTrait, key: Option<&str>, fingerprint: String, job: &str) -> Result<()> {
+    let Some(key) = key else { return Ok(()) };
+    let row = idempotency_key::ActiveModel {
+        key: Set(key.into()),
+        created_ms: Set(now_ms()),
+        fingerprint: Set(fingerprint),
+        job_id: Set(job.into()),
+    };
+    idempotency_key::Entity::insert(row).exec_without_returning(records).await?;
+    Ok(())
+}
+
+async fn insert_asset(records: &impl ConnectionTrait, name: &str) -> Result<()> {
+    let row = asset::ActiveModel { name: Set(name.into()), created_ms: Set(now_ms()) };
+    let keep = OnConflict::column(asset::Column::Name).do_nothing().to_owned();
+    asset::Entity::insert(row).on_conflict(keep).try_insert().exec_without_returning(records).await?;
+    Ok(())
+}
+
+fn check_name(field: &str, name: &str) -> Result<()> {
+    let plain =
+        !name.trim().is_empty() && name.chars().count() <= MAX_NAME_CHARS && !name.chars().any(char::is_control);
+    if plain {
+        return Ok(());
+    }
+    let expected = format!("1 to {MAX_NAME_CHARS} characters without control characters");
+    Err(Error::field(field, format!("{field} is {:?}", shorten(name)), expected))
+}
+
+fn check_chainage(chainage_mm: f64) -> Result<()> {
+    if chainage_mm.abs() <= MAX_CHAINAGE_MM {
+        return Ok(());
+    }
+    Err(Error::field(
+        "chainage_mm",
+        format!("chainage_mm is {chainage_mm} mm"),
+        format!("within ±{MAX_CHAINAGE_MM:e} mm"),
+    ))
+}
+
+fn check_note(note: &str) -> Result<()> {
+    if note.chars().count() <= MAX_NOTE_CHARS {
+        return Ok(());
+    }
+    let found = format!("the note has {} characters", note.chars().count());
+    Err(Error::field("note", found, format!("at most {MAX_NOTE_CHARS} characters")))
+}
+
+/// Reads a time of a request.
+pub fn read_time(field: &str, text: &str) -> Result<i64> {
+    from_text(text).ok_or_else(|| {
+        let found = format!("{field} is {:?}", shorten(text));
+        Error::field(field, found, format!("a time as RFC 3339 writes it, such as {}", to_text(1_778_000_000_000)))
+    })
+}
+
+/// What somebody sent, short enough to be said back.
+fn shorten(text: &str) -> String {
+    const MOST: usize = 60;
+    if text.chars().count() <= MOST { text.into() } else { text.chars().take(MOST).chain(['…']).collect() }
+}
+
+fn to_i64(value: u64) -> i64 {
+    i64::try_from(value).unwrap_or(i64::MAX)
+}
+
+fn to_u64(value: i64) -> u64 {
+    u64::try_from(value).unwrap_or(0)
+}

@@ -1,0 +1,42 @@
+//! The JSON shapes that cross the wire, and between the server and its child processes.
+//!
+//! Core's types never cross the HTTP wire directly; the OpenAPI document is generated from these.
+
+pub mod child;
+mod job;
+mod lists;
+mod run;
+pub mod time;
+
+pub use job::{Job, JobState, LogLine, Priority, Product, Recording, RecordingSegment, Reprocess};
+pub use lists::{
+    Asset, AssetPage, Health, JobPage, LogPage, OptionRange, ProductPage, Recipe, RecipeOption, Rig, RigPage, RunPage,
+    Worker,
+};
+pub use run::{Direction, Run, RunChange, RunSource};
+
+use serde::{Deserialize, Serialize};
+use utoipa::ToSchema;
+
+/// What went wrong, as RFC 9457 writes it; on a job, why it failed (then without `status`).
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize, ToSchema)]
+pub struct Problem {
+    /// A name for the kind of problem that programs can compare.
+    #[serde(rename = "type")]
+    pub kind: String,
+    /// The kind in words.
+    pub title: String,
+    /// The HTTP status.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub status: Option<u16>,
+    /// This case in words: what was found, with its unit.
+    pub detail: String,
+    /// The field at fault.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub field: Option<String>,
+    /// What would have been right.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub expected: Option<String>,
+    /// True where the same request may succeed later.
+    pub retryable: bool,
+}

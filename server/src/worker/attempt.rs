@@ -1,0 +1,180 @@
+//! One attempt at a job, from its lease to its one end.
+
+use std::time::Duration;
+
+use stria_core::pipeline::Event;
+use tokio::sync::watch;
+use tokio::time::Instant;
+
+use super::child::{Child, Said};
+use super::scratch::Scratch;
+use super::{Worker, publish};
+use crate::error::{Error, Result};
+use crate::queue::{Lease, Outcome, Progress, Signal};
+use crate::store::Key;
+use crate::wire::child::Failure;
+
+/// The stage after the last product is written: the products go into the store.
+const STORING: &str = "storing";
+
+/// How an attempt ended.
+enum Ended {
+    Done(Outcome),
+    Failed(Failure),
+    Cancelled,
+    /// Another owns the job, or it is gone: nothing may be written any more.
+    Lost,
+    /// The worker stops; the job goes back.
+    Released,
+}
+
+/// Works on a job until its end, whatever that is, and writes it down.
+pub(super) async fn run(worker: &Worker, lease: &Lease) {
+    tracing::info!(job = %lease.job, attempt = lease.attempt, "begins");
+    let (signals, heart) = beat(worker, lease);
+    let ended = match work(worker, lease, signals).await {
+        Ok(ended) => ended,
+        Err(Error::LeaseLost) => Ended::Lost,
+        Err(error @ Error::Internal(_)) => Ended::Failed(Failure::new("internal", error.to_string(), true)),
+        Err(error) => Ended::Failed(Failure::new("io", error.to_string(), true)),
+    };
+    heart.abort();
+    let written = match ended {
+        Ended::Done(outcome) => {
+            tracing::info!(job = %lease.job, products = outcome.products.len(), "done");
+            worker.queue.finish(lease, outcome).await
+        }
+        Ended::Failed(failure) => {
+            tracing::warn!(job = %lease.job, kind = failure.kind, message = failure.message, "failed");
+            worker.queue.fail(lease, &failure).await
+        }
+        Ended::Cancelled => worker.queue.cancelled(lease).await,
+        Ended::Released => worker.queue.release(lease).await,
+        Ended::Lost => Err(Error::LeaseLost),
+    };
+    match written {
+        Ok(()) => {}
+        Err(Error::LeaseLost) => tracing::warn!(job = %lease.job, "the lease was lost; the attempt counts for nothing"),
+        // The lease runs out or is taken back at the next start; then the job is tried again.
+        Err(error) => tracing::error!(job = %lease.job, %error, "the end of an attempt could not be written"),
+    }
+    // Only now: a file of this name is what tells a leftover from an attempt that still runs.
+    Scratch::remove(&worker.scratch, lease).await;
+}
+
+/// Signs of life and the answer to them, apart from the work.
+fn beat(worker: &Worker, lease: &Lease) -> (watch::Receiver<Signal>, tokio::task::JoinHandle<()>) {
+    let (sender, receiver) = watch::channel(Signal::Continue);
+    let (queue, limits, lease) = (worker.queue.clone(), worker.limits.clone(), lease.clone());
+    let task = tokio::spawn(async move {
+        let mut last_beat = Instant::now();
+        loop {
+            tokio::time::sleep(limits.cancel_poll).await;
+            let signal = async {
+                if last_beat.elapsed() >= limits.heartbeat {
+                    queue.beat(&lease).await?;
+                    last_beat = Instant::now();
+                }
+                queue.signal(&lease).await
+            };
+            match signal.await {
+                Ok(signal) => drop(sender.send(signal)),
+                Err(Error::LeaseLost) => drop(sender.send(Signal::Lost)),
+                // The records may be back in a moment; if they are not, the lease runs out.
+                Err(error) => tracing::warn!(%error, "no sign of life could be given"),
+            }
+        }
+    });
+    (receiver, task)
+}
+
+async fn work(worker: &Worker, lease: &Lease, mut signals: watch::Receiver<Signal>) -> Result<Ended> {
+    worker.queue.log(lease, &format!("attempt {} begins on worker '{}'", lease.attempt, worker.name)).await?;
+    let scratch = Scratch::make(&worker.scratch, lease).await?;
+    let source = worker.store.local_file(&Key::source(&lease.run, &lease.source_extension))?;
+    let mut child = Child::start(worker, lease, &scratch, &source)?;
+    let deadline = Instant::now() + worker.limits.time_limit;
+    let mut teller = Teller { worker, lease, scratch: &scratch, told: None, stderr_lines: 0 };
+    let stopped = loop {
+        let said = tokio::select! {
+            said = child.next() => said,
+            ended = interrupted(worker, &mut signals) => break Some(ended),
+            () = tokio::time::sleep_until(deadline) => break Some(Ended::Failed(too_long(worker.limits.time_limit))),
+        };
+        match said {
+            Some(said) => teller.tell(said).await?,
+            None => break None,
+        }
+    };
+    if let Some(ended) = stopped {
+        child.kill().await;
+        return Ok(ended);
+    }
+    let manifest = match child.end().await {
+        Ok(manifest) => manifest,
+        Err(failure) => return Ok(Ended::Failed(failure)),
+    };
+    let storing =
+        Progress { stage: STORING.into(), fraction: 1.0, frames: manifest.quality.frames, ..Progress::default() };
+    worker.queue.progress(lease, &storing).await?;
+    tokio::select! {
+        outcome = publish::store(worker, lease, &scratch, *manifest) => Ok(Ended::Done(outcome?)),
+        ended = interrupted(worker, &mut signals) => Ok(ended),
+    }
+}
+
+/// Returns when the attempt shall not go on.
+async fn interrupted(worker: &Worker, signals: &mut watch::Receiver<Signal>) -> Ended {
+    let signal = tokio::select! {
+        signal = signals.wait_for(|s| *s != Signal::Continue) => signal.map(|s| *s),
+        () = worker.stop.cancelled() => return Ended::Released,
+    };
+    match signal {
+        Ok(Signal::Cancel) => Ended::Cancelled,
+        // Without a heart the lease runs out unseen.
+        Ok(_) | Err(_) => Ended::Lost,
+    }
+}
+
+fn too_long(limit: Duration) -> Failure {
+    let hours = limit.as_secs_f64() / 3600.0;
+    Failure::new("time_limit", format!("the attempt took longer than {hours:.3} h, the limit of this server"), false)
+}
+
+/// Brings what the child says to the records.
+struct Teller<'a> {
+    worker: &'a Worker,
+    lease: &'a Lease,
+    scratch: &'a Scratch,
+    told: Option<(Instant, String)>,
+    stderr_lines: usize,
+}
+
+impl Teller<'_> {
+    async fn tell(&mut self, said: Said) -> Result<()> {
+        let (queue, limits) = (&self.worker.queue, &self.worker.limits);
+        match said {
+            Said::Event(Event::Progress { stage, fraction, frames, frames_total, frames_per_s, time_left_s }) => {
+                let fresh =
+                    self.told.as_ref().is_some_and(|(at, told)| *told == stage && at.elapsed() < limits.progress_every);
+                if fresh {
+                    return Ok(());
+                }
+                self.told = Some((Instant::now(), stage.clone()));
+                let progress = Progress { stage, fraction, frames, frames_total, frames_per_s, time_left_s };
+                queue.progress(self.lease, &progress).await
+            }
+            Said::Event(Event::Warning { message }) => queue.log(self.lease, &format!("warning: {message}")).await,
+            Said::Event(Event::Segment { number, path, .. }) => {
+                publish::segment(self.worker, self.lease, self.scratch, number, &path).await
+            }
+            Said::Stderr(line) => {
+                self.stderr_lines += 1;
+                if self.stderr_lines > limits.stderr_lines {
+                    return Ok(());
+                }
+                queue.log(self.lease, &line).await
+            }
+        }
+    }
+}

@@ -1,0 +1,74 @@
+//! What a child made → the store, checked; the records follow in one transaction (`Queue::finish`).
+
+use std::path::{Component, Path};
+
+use stria_core::export::manifest::{FileEntry, Manifest};
+
+use super::Worker;
+use super::scratch::Scratch;
+use crate::error::{Error, Result};
+use crate::queue::{Lease, Outcome, PublishedProduct};
+use crate::store::{Facts, Key, ProductName, facts_of};
+
+/// The list of the products is a product itself, and the only one that cannot list its own hash.
+const MANIFEST: &str = "manifest.json";
+
+/// Puts every product into the store under the attempt's own keys.
+pub(super) async fn store(worker: &Worker, lease: &Lease, scratch: &Scratch, manifest: Manifest) -> Result<Outcome> {
+    let out = scratch.out();
+    let path = out.join(MANIFEST);
+    let own = tokio::task::spawn_blocking(move || facts_of(&path).map_err(|e| Error::io(path, e)))
+        .await
+        .map_err(|e| Error::Internal(format!("reading the manifest stopped: {e}")))??;
+    let listed = manifest.products.into_iter().filter(|p| p.name != MANIFEST);
+    let mut products = vec![PublishedProduct { name: name(MANIFEST)?, facts: own }];
+    for FileEntry { name: text, bytes, sha256 } in listed {
+        products.push(PublishedProduct { name: name(&text)?, facts: Facts { bytes, sha256 } });
+    }
+    // A person looks for the files first; the tiles are for programs.
+    products.sort_by_key(|p| p.name.as_str().contains('/'));
+    for product in &products {
+        let file = out.join(product.name.as_str());
+        check_plain_file(&out, &file, product.facts.bytes).await?;
+        let key = Key::product(&lease.job, lease.fence, &product.name);
+        worker.store.take_file(&file, &key).await?;
+        let stored = worker.store.size(&key).await?;
+        if stored != product.facts.bytes {
+            let (name, listed) = (product.name.as_str(), product.facts.bytes);
+            return Err(Error::Internal(format!("{name} has {stored} bytes in the store, {listed} in the manifest")));
+        }
+    }
+    worker.store.sync().await?;
+    let quality = serde_json::to_value(&manifest.quality).map_err(|e| Error::Internal(format!("quality: {e}")))?;
+    Ok(Outcome { products, warnings: manifest.warnings, quality, frames: manifest.quality.frames })
+}
+
+/// Puts a recording segment into the store while the child goes on.
+pub(super) async fn segment(worker: &Worker, lease: &Lease, scratch: &Scratch, number: u32, path: &str) -> Result<()> {
+    let inside = Path::new(path).components().all(|c| matches!(c, Component::Normal(_)));
+    if !inside {
+        return Err(Error::Internal(format!("the child named a segment outside its folder: {path:?}")));
+    }
+    let file = scratch.out().join(path);
+    let bytes = tokio::fs::symlink_metadata(&file).await.map_err(|e| Error::io(&file, e))?.len();
+    if bytes > worker.limits.segment_bytes {
+        let most = worker.limits.segment_bytes;
+        return Err(Error::Internal(format!("recording segment {number} has {bytes} bytes; at most {most} are taken")));
+    }
+    let facts = worker.store.copy_file(&file, &Key::segment(&lease.job, lease.fence, number)).await?;
+    worker.queue.segment(lease, number, &facts).await
+}
+
+fn name(text: &str) -> Result<ProductName> {
+    ProductName::new(text).ok_or_else(|| Error::Internal(format!("the child named a product {text:?}")))
+}
+
+/// A product is a file of the listed size, and no link to somewhere else.
+async fn check_plain_file(out: &Path, file: &Path, bytes: u64) -> Result<()> {
+    let facts = tokio::fs::symlink_metadata(file).await.map_err(|e| Error::io(file, e))?;
+    if facts.is_file() && facts.len() == bytes {
+        return Ok(());
+    }
+    let name = file.strip_prefix(out).unwrap_or(file).display();
+    Err(Error::Internal(format!("{name} is not the file of {bytes} bytes that the manifest lists")))
+}

@@ -1,0 +1,154 @@
+// What the browser tests share: a server of their own, a simulated run, a browser that watches over every request.
+
+import assert from "node:assert/strict";
+import { execFile, spawn } from "node:child_process";
+import { existsSync } from "node:fs";
+import { mkdtemp, readFile, rm, writeFile } from "node:fs/promises";
+import { createServer } from "node:net";
+import { tmpdir } from "node:os";
+import path from "node:path";
+import { setTimeout as sleep } from "node:timers/promises";
+import { fileURLToPath } from "node:url";
+import { promisify } from "node:util";
+import { chromium } from "playwright-core";
+
+const repository = path.resolve(path.dirname(fileURLToPath(import.meta.url)), "../..");
+const stria = process.env.STRIA_BIN ?? path.join(repository, "target/release/stria");
+const chromiumPath = process.env.CHROMIUM_BIN ?? "/usr/bin/chromium";
+
+/** Where screenshots go, for people to look at. */
+const pictures = process.env.STRIA_PICTURES ?? path.join(repository, "target/browser");
+
+const READY_MS = 20_000;
+
+/** Starts `stria serve` on a free port with an empty data folder; `stop` ends it and checks that it was still well. */
+export async function startServer() {
+  need(stria, "run `make build`, or set STRIA_BIN");
+  const folder = await mkdtemp(path.join(tmpdir(), "stria-browser-"));
+  const url = `http://127.0.0.1:${await freePort()}`;
+  const child = spawn(stria, ["serve", "--listen", new URL(url).host, "--data", path.join(folder, "data")], { stdio: ["ignore", "pipe", "pipe"] });
+  let said = "";
+  for (const stream of [child.stdout, child.stderr]) stream.on("data", (bytes) => (said += bytes));
+  const ended = new Promise((done) => child.once("exit", (code, signal) => done(signal ?? code)));
+  let gone = false;
+  void ended.then(() => (gone = true));
+  await until(`${stria} serve answers at ${url}`, READY_MS, async () => {
+    assert.ok(!gone, `stria serve ended at once:\n${said}`);
+    return (await fetch(`${url}/readyz`).catch(() => null))?.ok;
+  });
+  const stop = async () => {
+    const well = !gone && (await fetch(`${url}/livez`).catch(() => null))?.ok;
+    child.kill("SIGTERM");
+    const end = await Promise.race([ended, sleep(10_000, "still running 10 s after SIGTERM", { ref: false })]);
+    if (!gone) child.kill("SIGKILL");
+    await rm(folder, { recursive: true, force: true });
+    assert.ok(well, `the server no longer answered:\n${said}`);
+    assert.equal(end, 0, `stria serve ended with ${end}:\n${said}`);
+  };
+  return { url, stop };
+}
+
+/** Makes a realistic run in a new folder: its video, its rig. `remove` takes the folder away. */
+export async function simulate({ seconds = 2, size = "640x360", seed = 1 } = {}) {
+  need(stria, "run `make build`, or set STRIA_BIN");
+  const folder = await mkdtemp(path.join(tmpdir(), "stria-run-"));
+  const out = path.join(folder, "run");
+  await promisify(execFile)(stria, ["simulate", "pipe", "--out", out, "--seconds", `${seconds}`, "--size", size, "--seed", `${seed}`]);
+  return {
+    folder,
+    video: path.join(out, "video.mp4"),
+    rig: path.join(out, "rig.toml"),
+    remove: () => rm(folder, { recursive: true, force: true }),
+  };
+}
+
+/** A rig file like `rig` but for images of twice the width. */
+export async function rigForOtherSize(rig, folder) {
+  const text = await readFile(rig, "utf8");
+  const other = text.replace(/^(\s*width_px\s*=\s*)(\d+)/m, (_, key, width) => `${key}${2 * Number(width)}`);
+  assert.notEqual(other, text, "the rig file names its width");
+  const file = path.join(folder, "other-size.toml");
+  await writeFile(file, other);
+  return file;
+}
+
+/** Starts Chromium with a fresh profile; WebGL is drawn in software, so that it works on any machine. */
+export async function startBrowser() {
+  need(chromiumPath, "run `make setup`, which installs Chromium, or set CHROMIUM_BIN");
+  const quiet = ["--disable-quic", "--no-first-run", "--disable-background-networking", "--disable-component-update", "--disable-sync"];
+  const webgl = ["--use-gl=angle", "--use-angle=swiftshader", "--enable-unsafe-swiftshader"];
+  return chromium.launch({ executablePath: chromiumPath, args: ["--no-sandbox", ...quiet, ...webgl] });
+}
+
+/**
+ * Opens a page. What must never happen is collected: a request to another host, something that the content security
+ * policy had to stop, an error in a script. `close` closes the page and fails where there was any.
+ */
+export async function openPage(browser, server, options = {}) {
+  const context = await browser.newContext({ baseURL: server.url, viewport: { width: 1440, height: 900 }, ...options });
+  const violations = [];
+  context.on("request", (request) => {
+    const { protocol, origin } = new URL(request.url());
+    if (origin !== server.url && protocol !== "blob:" && protocol !== "data:") violations.push(`request to ${request.url()}`);
+  });
+  context.on("console", (message) => {
+    if (/content security policy|refused to/i.test(message.text())) violations.push(`console: ${message.text()}`);
+  });
+  context.on("weberror", (error) => violations.push(`error in a script: ${error.error().stack}`));
+  const page = await context.newPage();
+  const close = async () => {
+    await context.close();
+    assert.deepEqual(violations, []);
+  };
+  return { page, context, close };
+}
+
+/** Asks until it is true or there is a value; fails after a time, naming what it waited for. */
+export async function until(what, withinMs, ask) {
+  const end = Date.now() + withinMs;
+  for (;;) {
+    const answer = await ask();
+    if (answer) return answer;
+    if (Date.now() > end) assert.fail(`waited ${withinMs / 1000} s in vain: ${what}`);
+    await sleep(50);
+  }
+}
+
+/** JSON from the server, past the browser. */
+export async function getJson(server, address) {
+  const response = await fetch(new URL(address, server.url));
+  assert.ok(response.ok, `${address}: HTTP ${response.status}`);
+  return response.json();
+}
+
+/** Lets files go over an element, as a person who drags them from a file manager. */
+export async function dropFiles(page, target, files) {
+  const contents = await Promise.all(files.map(async (file) => ({ name: path.basename(file), base64: (await readFile(file)).toString("base64") })));
+  const transfer = await page.evaluateHandle((all) => {
+    const data = new DataTransfer();
+    for (const { name, base64 } of all) data.items.add(new File([Uint8Array.from(atob(base64), (c) => c.charCodeAt(0))], name));
+    return data;
+  }, contents);
+  for (const event of ["dragenter", "dragover", "drop"]) await target.dispatchEvent(event, { dataTransfer: transfer });
+}
+
+/** Keeps a picture of the page or of a part of it for people to look at. */
+export async function keepPicture(target, name) {
+  return target.screenshot({ path: path.join(pictures, `${name}.png`), ...("goto" in target ? { fullPage: true } : {}) });
+}
+
+function need(file, otherwise) {
+  assert.ok(existsSync(file), `${file} is missing: ${otherwise}`);
+}
+
+/** A port that was free a moment ago. */
+function freePort() {
+  return new Promise((done, failed) => {
+    const probe = createServer();
+    probe.once("error", failed);
+    probe.listen(0, "127.0.0.1", () => {
+      const { port } = probe.address();
+      probe.close(() => done(port));
+    });
+  });
+}

@@ -1,0 +1,154 @@
+// The 3D view shows the measured surface: pixels on the canvas that are there with it and not without it.
+
+import assert from "node:assert/strict";
+import { execFile } from "node:child_process";
+import { existsSync } from "node:fs";
+import { readFile, writeFile } from "node:fs/promises";
+import path from "node:path";
+import { after, before, test } from "node:test";
+import { setTimeout as sleep } from "node:timers/promises";
+import { fileURLToPath } from "node:url";
+import { promisify } from "node:util";
+import { getJson, keepPicture, openPage, simulate, startBrowser, startServer, until } from "./support.mjs";
+
+const rerun = path.resolve(path.dirname(fileURLToPath(import.meta.url)), "../../target/python/bin/rerun");
+const DONE_MS = 120_000;
+const SHOWN_MS = 60_000;
+
+/** Share of the 3D view's pixels that the surface must colour, and how many times more than stand there without it. */
+const SURFACE_SHARE = 0.02;
+const SURFACE_TIMES = 5;
+
+let server, browser;
+
+before(async () => {
+  [server, browser] = await Promise.all([startServer(), startBrowser()]);
+});
+after(async () => {
+  await browser?.close();
+  await server?.stop();
+});
+
+test("a finished run: the surface is on the canvas, and its pixels are the surface's", async () => {
+  const run = await simulate();
+  const { page, close } = await openPage(browser, server);
+  await send(page, run);
+  await page.getByRole("heading", { name: "Files to download" }).waitFor({ timeout: DONE_MS });
+  const address = page.url();
+  assert.equal(await page.locator("canvas").count(), 0, "nothing of the viewer is there before it is asked for");
+
+  await page.getByRole("button", { name: "Open 3D view" }).click();
+  await page.getByText("The whole recording is shown").waitFor({ timeout: SHOWN_MS });
+  const withSurface = await settledShare(page);
+  await keepPicture(page.locator(".view"), "view3d");
+
+  // The same recording without the surface's points must look different just there.
+  const { items } = await getJson(server, `/api/runs?limit=1`);
+  const bare = await withoutSurface(items[0].job.id, run.folder);
+  await page.route("**/recording/*", (route) => route.fulfill({ body: bare, contentType: "application/octet-stream" }));
+  await page.route("**/recording", (route) =>
+    route.fulfill({ json: { segments: [{ number: 0, generation: 1, bytes: bare.length, url: "/recording/0" }], complete: true, recording: null } }),
+  );
+  await page.goto(address);
+  await page.getByRole("button", { name: "Open 3D view" }).click();
+  await page.getByText("The whole recording is shown").waitFor({ timeout: SHOWN_MS });
+  const bareShare = await settledShare(page);
+  await keepPicture(page.locator(".view"), "view3d-without-surface");
+
+  const shares = `coloured share of the 3D view: ${withSurface.toFixed(4)} with the surface, ${bareShare.toFixed(4)} without`;
+  assert.ok(withSurface > SURFACE_SHARE, shares);
+  assert.ok(withSurface > SURFACE_TIMES * bareShare, shares);
+  await run.remove();
+  await close();
+});
+
+test("a run that is being measured: the surface is on the canvas before the job has ended", async () => {
+  const run = await simulate({ seconds: 25 });
+  const { page, close } = await openPage(browser, server);
+  // The viewer is in the browser's cache and compiled when the job starts, as for anyone who watches a second run.
+  await page.goto("/");
+  await send(page, run);
+  await page.getByRole("button", { name: "Open 3D view" }).click();
+  await page.getByText(/^Live: \d+ parts? received/).waitFor({ timeout: SHOWN_MS });
+  const share = await until("the surface shows while the job runs", DONE_MS, async () => {
+    const now = await colouredShare(page);
+    const { job } = await getJson(server, `/api/runs/${new URL(page.url()).pathname.split("/").at(-1)}`);
+    assert.equal(job.state, "running", `the job ended before its surface was seen (share ${now})`);
+    return now > SURFACE_SHARE / 4 && now;
+  });
+  assert.ok(share > 0);
+  await keepPicture(page.locator(".view"), "view3d-live");
+  await page.getByText("The whole recording is shown").waitFor({ timeout: DONE_MS });
+  await run.remove();
+  await close();
+});
+
+test("the keyboard gets out of the 3D view, and it closes and opens again", async () => {
+  const run = await simulate();
+  const { page, close } = await openPage(browser, server);
+  await send(page, run);
+  await page.getByRole("heading", { name: "Files to download" }).waitFor({ timeout: DONE_MS });
+  for (let round = 0; round < 2; round += 1) {
+    await page.getByRole("button", { name: "Open 3D view" }).click();
+    await page.getByText("The whole recording is shown").waitFor({ timeout: SHOWN_MS });
+    await page.locator("canvas").click();
+    await page.keyboard.press("Escape");
+    assert.equal(await page.evaluate(() => document.activeElement?.textContent), "Close 3D view");
+    await page.keyboard.press("Enter");
+    await page.locator("canvas").waitFor({ state: "detached" });
+  }
+  await run.remove();
+  await close();
+});
+
+async function send(page, run) {
+  await page.goto("/");
+  await page.getByLabel("Choose files").setInputFiles([run.video, run.rig]);
+  await page.getByLabel("Asset").fill("seen in 3D");
+  await page.getByRole("button", { name: "Send the run" }).click();
+  await page.waitForURL(/\/runs\//);
+}
+
+/** The job's recording with the surface's points taken out, by rerun's own tool. */
+async function withoutSurface(job, folder) {
+  assert.ok(existsSync(rerun), `${rerun} is missing: run \`make setup\``);
+  const response = await fetch(new URL(`/api/jobs/${job}/products/recording.rrd`, server.url));
+  const [whole, bare] = [path.join(folder, "whole.rrd"), path.join(folder, "bare.rrd")];
+  await writeFile(whole, Buffer.from(await response.arrayBuffer()));
+  await promisify(execFile)(rerun, ["rrd", "filter", "--drop-entity", "/world/surface", "-o", bare, whole]);
+  return readFile(bare);
+}
+
+/** The coloured share once it has stopped changing. */
+async function settledShare(page) {
+  let before = -1;
+  for (let turn = 0; turn < 30; turn += 1) {
+    await sleep(700);
+    const now = await colouredShare(page);
+    if (before >= 0 && Math.abs(now - before) < 0.002 && turn >= 3) return now;
+    before = now;
+  }
+  return before;
+}
+
+/**
+ * Share of the pixels with a strong colour in the 3D view, which the recording's layout puts at the top left. The
+ * surface is drawn from red over yellow and green to blue; ground, grid and letters are gray or pale.
+ */
+async function colouredShare(page) {
+  const picture = (await page.locator("canvas").screenshot()).toString("base64");
+  return page.evaluate(async (base64) => {
+    const bytes = Uint8Array.from(atob(base64), (c) => c.charCodeAt(0));
+    const image = await createImageBitmap(new Blob([bytes], { type: "image/png" }));
+    const [width, height] = [Math.floor(image.width * 0.54), Math.floor(image.height * 0.55)];
+    const context = new OffscreenCanvas(width, height).getContext("2d");
+    context.drawImage(image, 0, 0);
+    const { data } = context.getImageData(0, 0, width, height);
+    let coloured = 0;
+    for (let at = 0; at < data.length; at += 4) {
+      const [r, g, b] = [data[at], data[at + 1], data[at + 2]];
+      if (Math.max(r, g, b) - Math.min(r, g, b) > 70) coloured += 1;
+    }
+    return coloured / (width * height);
+  }, picture);
+}

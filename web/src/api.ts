@@ -1,0 +1,235 @@
+// Everything the pages ask of the server. The only file that fetches; shapes come from the OpenAPI document.
+
+import type { components } from "./api.gen.ts";
+
+type Schemas = components["schemas"];
+export type Run = Schemas["Run"];
+export type RunPage = Schemas["RunPage"];
+export type Job = Schemas["Job"];
+export type JobPage = Schemas["JobPage"];
+export type JobState = Schemas["JobState"];
+export type LogLine = Schemas["LogLine"];
+export type Product = Schemas["Product"];
+export type Recording = Schemas["Recording"];
+export type RecordingSegment = Schemas["RecordingSegment"];
+export type Rig = Schemas["Rig"];
+export type Recipe = Schemas["Recipe"];
+export type Problem = Schemas["Problem"];
+
+/** What we read of a job's `manifest.json`. A file of the product folder, not a shape of the HTTP interface. */
+export interface Manifest {
+  quality: {
+    frames: number;
+    frames_with_stripe: number;
+    frames_tracked: number;
+    rows_found: number;
+    points: number;
+    coverage: number;
+    travel_mm: number;
+    duration_s: number;
+  };
+  resolution: { distance_mm: number; r_depth_mm: number } | null;
+  gaps: { first_frame: number; last_frame: number; reason: string }[];
+}
+
+/** What the server answered when it refused, or what kept us from reaching it. */
+export class ApiError extends Error {
+  override readonly name = "ApiError";
+  constructor(readonly problem: Problem) {
+    super(problem.detail);
+  }
+}
+
+/** No answer at all: the only problem of ours, and the only one without a detail. */
+export const UNREACHABLE: Problem = { type: "about:blank", title: "No answer from the server", detail: "", retryable: true };
+
+/** The problem in any error, for showing. */
+export function problemOf(error: unknown): Problem {
+  if (error instanceof ApiError) return error.problem;
+  return { type: "about:blank", title: "Unexpected error", detail: error instanceof Error ? error.message : String(error), retryable: false };
+}
+
+function problemIn(status: number, body: string): Problem {
+  try {
+    const problem = JSON.parse(body) as Partial<Problem>;
+    if (typeof problem.title === "string" && typeof problem.detail === "string") return problem as Problem;
+  } catch {
+    // A proxy's HTML page, for example: its status is all we can tell.
+  }
+  const title = `The server answered with status ${status}`;
+  return { type: "about:blank", title, status, detail: body.slice(0, 200) || title, retryable: status >= 500 };
+}
+
+async function request(path: string, init?: RequestInit): Promise<Response> {
+  let response: Response;
+  try {
+    response = await fetch(path, init);
+  } catch (error) {
+    if (init?.signal?.aborted) throw error;
+    throw new ApiError(UNREACHABLE);
+  }
+  if (response.ok) return response;
+  throw new ApiError(problemIn(response.status, await response.text().catch(() => "")));
+}
+
+async function json<T>(path: string, init?: RequestInit): Promise<T> {
+  return (await (await request(path, init)).json()) as T;
+}
+
+/** A key that nobody else uses. (`crypto.randomUUID` exists only under HTTPS and on localhost.) */
+function newKey(): string {
+  return Array.from(crypto.getRandomValues(new Uint8Array(16)), (byte) => byte.toString(16).padStart(2, "0")).join("");
+}
+
+/** A creating request: the same key makes a repeated request the same result. */
+function creating(body?: unknown): RequestInit {
+  const headers: Record<string, string> = { "idempotency-key": newKey() };
+  if (body === undefined) return { method: "POST", headers };
+  return { method: "POST", headers: { ...headers, "content-type": "application/json" }, body: JSON.stringify(body) };
+}
+
+const at = encodeURIComponent;
+
+/** Runs from the newest on; `cursor` is null for the first page. */
+export const listRuns = (cursor: string | null, limit: number): Promise<RunPage> =>
+  json(`/api/runs?limit=${limit}${cursor === null ? "" : `&cursor=${at(cursor)}`}`);
+export const getRun = (run: string): Promise<Run> => json(`/api/runs/${at(run)}`);
+export const deleteRun = (run: string): Promise<Response> => request(`/api/runs/${at(run)}`, { method: "DELETE" });
+
+/** A run's jobs, the newest first. */
+export const listJobs = async (run: string): Promise<Job[]> => (await json<JobPage>(`/api/jobs?run=${at(run)}`)).items;
+
+/** A new job for a run; what is left out stays as in its latest job. */
+export const reprocess = (run: string, change: { recipe?: string; rig?: string }): Promise<Job> =>
+  json(`/api/runs/${at(run)}/jobs`, creating(change));
+export const cancelJob = (job: string): Promise<Response> => request(`/api/jobs/${at(job)}/cancel`, creating());
+export const retryJob = (job: string): Promise<Response> => request(`/api/jobs/${at(job)}/retry`, creating());
+
+export const listRigs = async (): Promise<Rig[]> => (await json<Schemas["RigPage"]>("/api/rigs")).items;
+export const listRecipes = (): Promise<Recipe[]> => json("/api/recipes");
+
+/** A job's whole log. */
+export async function listLog(job: string): Promise<LogLine[]> {
+  const lines: LogLine[] = [];
+  let cursor: string | null | undefined = "";
+  while (cursor !== null && cursor !== undefined) {
+    const page: Schemas["LogPage"] = await json(`/api/jobs/${at(job)}/log?limit=1000${cursor === "" ? "" : `&cursor=${at(cursor)}`}`);
+    lines.push(...page.items);
+    cursor = page.next_cursor;
+  }
+  return lines;
+}
+
+/** A job's products: files at the top of the folder first, tiles after them; one page is enough for the files. */
+export const listProducts = (job: string): Promise<Schemas["ProductPage"]> => json(`/api/jobs/${at(job)}/products`);
+export const getManifest = (job: string): Promise<Manifest> => json(productPath(job, "manifest.json"));
+
+export const getRecording = (job: string): Promise<Recording> => json(`/api/jobs/${at(job)}/recording`);
+export const getBytes = async (path: string): Promise<Uint8Array> => new Uint8Array(await (await request(path)).arrayBuffer());
+
+/** A large file of our own server, telling how many bytes have come, of all where the server says so. */
+export async function getLarge(path: string, progress: (loadedBytes: number, totalBytes: number | null) => void): Promise<Response> {
+  const response = await request(path);
+  // Content-Length counts compressed bytes where the server compresses, so it tells the total only where it does not.
+  const length = response.headers.get("content-encoding") === null ? response.headers.get("content-length") : null;
+  let loadedBytes = 0;
+  const counting = new TransformStream<Uint8Array, Uint8Array>({
+    transform(chunk, controller) {
+      loadedBytes += chunk.byteLength;
+      progress(loadedBytes, length === null ? null : Number(length));
+      controller.enqueue(chunk);
+    },
+  });
+  return new Response(response.body?.pipeThrough(counting) ?? null, { headers: response.headers });
+}
+
+/** The address of a product, for links and images. */
+export function productPath(job: string, name: string): string {
+  return `/api/jobs/${at(job)}/products/${name.split("/").map(at).join("/")}`;
+}
+
+/** A run to be sent. */
+export interface Upload {
+  video: File;
+  /** A stored rig's name, or a rig file. */
+  rig: string | File;
+  asset: string;
+  recipe: string;
+}
+
+/**
+ * Sends one run in one request. `progress` hears the bytes sent so far, of all; fetch cannot tell that, XMLHttpRequest
+ * can. Aborting the signal stops the sending.
+ */
+export function sendRun(upload: Upload, progress: (sent: number, all: number) => void, signal: AbortSignal): Promise<Run> {
+  const form = new FormData();
+  // Small fields first: the server can refuse a bad one before the video has been sent.
+  form.append("asset", upload.asset);
+  form.append("recipe", upload.recipe);
+  if (typeof upload.rig === "string") form.append("rig", upload.rig);
+  else form.append("rig", upload.rig, upload.rig.name);
+  // Browsers write a quote in a part's own file name as %22; a field of its own keeps the name as it is.
+  form.append("filename", upload.video.name);
+  form.append("file", upload.video, upload.video.name);
+  return new Promise((done, failed) => {
+    const request = new XMLHttpRequest();
+    request.open("POST", "/api/runs");
+    request.setRequestHeader("idempotency-key", newKey());
+    request.upload.onprogress = (event) => progress(event.loaded, event.total);
+    request.onload = () => {
+      if (request.status >= 200 && request.status < 300) done(JSON.parse(request.responseText) as Run);
+      else failed(new ApiError(problemIn(request.status, request.responseText)));
+    };
+    request.onerror = () => failed(new ApiError(UNREACHABLE));
+    request.onabort = () => failed(new DOMException("stopped", "AbortError"));
+    signal.addEventListener("abort", () => request.abort());
+    request.send(form);
+  });
+}
+
+/** True while something may still happen to a job by itself. */
+export function isActive({ state }: { state: JobState }): boolean {
+  return state === "queued" || state === "running";
+}
+
+/** What a job says while it goes on. */
+export interface JobListener {
+  /** The job as it is now. */
+  job(job: Job): void;
+  /** A recording segment may be fetched. */
+  segment(): void;
+  /** The stream of events is connected, or was lost and is being tried again. */
+  connected(connected: boolean): void;
+}
+
+const RECONNECT_MS = 3000;
+
+/** Follows a job's events until the returned function is called; connects again whenever the connection is lost. */
+export function followJob(job: string, listener: JobListener): () => void {
+  let source: EventSource;
+  let timer: ReturnType<typeof setTimeout> | undefined;
+  const connect = () => {
+    source = new EventSource(`/api/jobs/${at(job)}/events`);
+    source.onopen = () => listener.connected(true);
+    source.onerror = () => {
+      listener.connected(false);
+      // The browser tries again by itself unless the server's answer was not a stream (a proxy's 502, for example).
+      if (source.readyState === EventSource.CLOSED) timer = setTimeout(connect, RECONNECT_MS);
+    };
+    const on = (name: string, heard: (data: string) => void) =>
+      source.addEventListener(name, (event) => heard((event as MessageEvent<string>).data));
+    const heardJob = (data: string) => {
+      const now = JSON.parse(data) as Job;
+      if (!isActive(now)) source.close(); // the server ends the stream here; no need to come back
+      listener.job(now);
+    };
+    on("state", heardJob);
+    on("progress", heardJob);
+    on("segment", () => listener.segment());
+  };
+  connect();
+  return () => {
+    clearTimeout(timer);
+    source.close();
+  };
+}

@@ -1,0 +1,31 @@
+// A button that asks the server for something: rests while it waits, shows the refusal beside itself.
+
+import type { ComponentChildren } from "preact";
+import { useState } from "preact/hooks";
+import { problemOf, type Problem } from "../api.ts";
+import { ProblemBox } from "./problem.tsx";
+
+type Props = { class?: string; disabled?: boolean; action: () => Promise<unknown>; children: ComponentChildren };
+
+export function ActionButton({ action, disabled, children, ...rest }: Props) {
+  const [waiting, setWaiting] = useState(false);
+  const [problem, setProblem] = useState<Problem | null>(null);
+  const press = async () => {
+    setWaiting(true);
+    setProblem(null);
+    try {
+      await action();
+    } catch (error) {
+      setProblem(problemOf(error));
+    }
+    setWaiting(false);
+  };
+  return (
+    <>
+      <button type="button" disabled={waiting || disabled} onClick={() => void press()} {...rest}>
+        {children}
+      </button>
+      {problem && <ProblemBox problem={problem} onDismiss={() => setProblem(null)} />}
+    </>
+  );
+}

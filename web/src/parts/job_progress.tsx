@@ -1,0 +1,69 @@
+// How far a job is, why it stopped, and what can be done about it.
+
+import { cancelJob, isActive, retryJob, type Job } from "../api.ts";
+import { percent } from "../format.ts";
+import { texts } from "../texts.ts";
+import { ActionButton } from "./action_button.tsx";
+import { ProblemBox } from "./problem.tsx";
+import { Warnings } from "./warnings.tsx";
+
+type Props = { job: Job; onChanged: () => void };
+
+export function JobProgress({ job, onChanged }: Props) {
+  if (job.state === "done") return null;
+  const act = (action: (job: string) => Promise<unknown>) => async () => {
+    await action(job.id);
+    onChanged();
+  };
+  return (
+    <section class="card">
+      <h2>{texts.progress.heading}</h2>
+      {isActive(job) && (
+        <>
+          {job.attempt > 1 && <p>{texts.progress.attempt(job.attempt)}</p>}
+          {job.error && <ProblemBox problem={job.error} heading={texts.progress.lastAttempt} />}
+          <p role="status">{job.cancelling ? texts.progress.cancelling : stageInWords(job)}</p>
+          {job.state === "running" && <Numbers job={job} />}
+          <p class="actions">
+            <ActionButton action={act(cancelJob)} disabled={job.cancelling}>
+              {texts.progress.cancel}
+            </ActionButton>
+          </p>
+        </>
+      )}
+      <Warnings warnings={job.warnings} />
+      {job.state === "failed" && (
+        <>
+          {job.error && <ProblemBox problem={job.error} />}
+          <p>{texts.progress.failedHint}</p>
+        </>
+      )}
+      {job.state === "cancelled" && <p>{texts.progress.cancelled}</p>}
+      {(job.state === "failed" || job.state === "cancelled") && (
+        <p class="actions">
+          <ActionButton action={act(retryJob)}>{texts.progress.retry}</ActionButton>
+        </p>
+      )}
+    </section>
+  );
+}
+
+function stageInWords(job: Job): string {
+  if (job.state === "queued") return texts.progress.queued;
+  return job.stage === "" ? texts.progress.starting : texts.progress.stage(job.stage);
+}
+
+function Numbers({ job }: { job: Job }) {
+  const parts = [
+    percent(job.progress),
+    texts.progress.frames(job.frames, job.frames_total ?? null),
+    ...(job.frames_per_s > 0 ? [texts.progress.rate(job.frames_per_s)] : []),
+    ...(job.time_left_s ? [texts.progress.left(job.time_left_s)] : []),
+  ];
+  return (
+    <>
+      <progress max={1} value={job.progress} aria-label={texts.progress.bar} />
+      <p class="faint">{parts.join(" · ")}</p>
+    </>
+  );
+}
