@@ -68,8 +68,11 @@ fn style(template: &str) -> ProgressStyle {
     ProgressStyle::with_template(template).unwrap_or_else(|_| ProgressStyle::default_bar()).progress_chars("█▉▊▋▌▍▎▏ ")
 }
 
-/// A time for people: `48 s`, `3 min 05 s`, `2 h 10 min`.
+/// A time for people: `2.1 s`, `48 s`, `3 min 05 s`, `2 h 10 min`.
 pub(super) fn duration(seconds: f64) -> String {
+    if (0.0..9.95).contains(&seconds) {
+        return format!("{seconds:.1} s");
+    }
     let whole = seconds.max(0.0).round() as u64;
     match (whole / 3600, whole / 60 % 60, whole % 60) {
         (0, 0, s) => format!("{s} s"),
@@ -96,7 +99,7 @@ mod tests {
 
     #[test]
     fn people_read_times_and_sizes() {
-        assert_eq!([0.4, 48.0, 185.0, 7800.0].map(duration), ["0 s", "48 s", "3 min 05 s", "2 h 10 min"]);
+        assert_eq!([0.4, 48.0, 185.0, 7800.0].map(duration), ["0.4 s", "48 s", "3 min 05 s", "2 h 10 min"]);
         assert_eq!([0, 999, 1_234_567, 64_000_000_000].map(size), ["0 B", "999 B", "1.2 MB", "64.0 GB"]);
     }
 

@@ -196,6 +196,7 @@ impl Queue {
     /// Publishes the result: state, products and the right to keep their files, at once.
     pub async fn finish(&self, lease: &Lease, outcome: Outcome) -> Result<()> {
         let t = self.db.write().await?;
+        let count = outcome.products.len();
         let warnings: Vec<_> = outcome.warnings.into_iter().take(self.limits.warnings).collect();
         let change = job::ActiveModel {
             stage: Set(String::new()),
@@ -221,6 +222,8 @@ impl Queue {
             product::Entity::insert_many(part.iter().cloned()).exec_without_returning(&*t).await?;
         }
         unpublished::Entity::delete_by_id(store::attempt_prefix(&lease.job, lease.fence)).exec(&*t).await?;
+        let line = format!("attempt {} is done: {count} products", lease.attempt);
+        add_log_line(&*t, &lease.job, lease.attempt, &line, &self.limits).await?;
         repeat_in_run(&*t, &lease.job, JobState::Done).await?;
         t.commit().await?;
         self.bell.ring();

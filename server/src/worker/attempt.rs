@@ -94,28 +94,28 @@ async fn work(worker: &Worker, lease: &Lease, mut signals: watch::Receiver<Signa
     let source = worker.store.local_file(&Key::source(&lease.run, &lease.source_extension))?;
     let mut child = Child::start(worker, lease, &scratch, &source)?;
     let deadline = Instant::now() + worker.limits.time_limit;
-    let mut teller = Teller { worker, lease, scratch: &scratch, told: None, stderr_lines: 0 };
-    let stopped = loop {
-        let said = tokio::select! {
-            said = child.next() => said,
-            ended = interrupted(worker, &mut signals) => break Some(ended),
-            () = tokio::time::sleep_until(deadline) => break Some(Ended::Failed(too_long(worker.limits.time_limit))),
-        };
-        match said {
-            Some(said) => teller.tell(said).await?,
-            None => break None,
+    let mut teller =
+        Teller { worker, lease, scratch: &scratch, told: None, progress: Progress::default(), stderr_lines: 0 };
+    let listened = async {
+        while let Some(said) = child.next().await {
+            teller.tell(said).await?;
+        }
+        Ok::<_, Error>(child.end().await)
+    };
+    let result = tokio::select! {
+        result = listened => Ok(result?),
+        ended = interrupted(worker, &mut signals) => Err(ended),
+        () = tokio::time::sleep_until(deadline) => Err(Ended::Failed(too_long(worker.limits.time_limit))),
+    };
+    let manifest = match result {
+        Ok(Ok(manifest)) => manifest,
+        Ok(Err(failure)) => return Ok(Ended::Failed(failure)),
+        Err(ended) => {
+            child.kill().await;
+            return Ok(ended);
         }
     };
-    if let Some(ended) = stopped {
-        child.kill().await;
-        return Ok(ended);
-    }
-    let manifest = match child.end().await {
-        Ok(manifest) => manifest,
-        Err(failure) => return Ok(Ended::Failed(failure)),
-    };
-    let storing =
-        Progress { stage: STORING.into(), fraction: 1.0, frames: manifest.quality.frames, ..Progress::default() };
+    let storing = Progress { stage: STORING.into(), fraction: 1.0, time_left_s: None, ..teller.progress };
     worker.queue.progress(lease, &storing).await?;
     tokio::select! {
         outcome = publish::store(worker, lease, &scratch, *manifest) => Ok(Ended::Done(outcome?)),
@@ -146,7 +146,9 @@ struct Teller<'a> {
     worker: &'a Worker,
     lease: &'a Lease,
     scratch: &'a Scratch,
-    told: Option<(Instant, String)>,
+    /// When progress was last written.
+    told: Option<Instant>,
+    progress: Progress,
     stderr_lines: usize,
 }
 
@@ -155,14 +157,14 @@ impl Teller<'_> {
         let (queue, limits) = (&self.worker.queue, &self.worker.limits);
         match said {
             Said::Event(Event::Progress { stage, fraction, frames, frames_total, frames_per_s, time_left_s }) => {
-                let fresh =
-                    self.told.as_ref().is_some_and(|(at, told)| *told == stage && at.elapsed() < limits.progress_every);
-                if fresh {
+                let progress = Progress { stage, fraction, frames, frames_total, frames_per_s, time_left_s };
+                let before = std::mem::replace(&mut self.progress, progress);
+                let same_stage = before.stage == self.progress.stage;
+                if same_stage && self.told.is_some_and(|at| at.elapsed() < limits.progress_every) {
                     return Ok(());
                 }
-                self.told = Some((Instant::now(), stage.clone()));
-                let progress = Progress { stage, fraction, frames, frames_total, frames_per_s, time_left_s };
-                queue.progress(self.lease, &progress).await
+                self.told = Some(Instant::now());
+                queue.progress(self.lease, &self.progress).await
             }
             Said::Event(Event::Warning { message }) => queue.log(self.lease, &format!("warning: {message}")).await,
             Said::Event(Event::Segment { number, path, .. }) => {

@@ -130,7 +130,7 @@ impl Child {
     }
 
     /// After its pipes are closed: what it made, or why it made nothing.
-    pub(super) async fn end(mut self) -> std::result::Result<Box<Manifest>, Failure> {
+    pub(super) async fn end(&mut self) -> std::result::Result<Box<Manifest>, Failure> {
         let status = match self.process.wait().await {
             Ok(status) => status,
             Err(e) => return Err(Failure::new("internal", format!("the child process was lost: {e}"), true)),
