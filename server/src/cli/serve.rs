@@ -34,7 +34,7 @@ pub(super) struct Serve {
     /// The folder that keeps everything
     #[arg(long, value_name = "DIR", default_value = "stria-data", env = "STRIA_DATA")]
     data: PathBuf,
-    /// Jobs at the same time [default: one per two processors]
+    /// Jobs at the same time; 0 takes runs in and lets them wait [default: one per two processors]
     #[arg(long, value_name = "N", env = "STRIA_WORKERS")]
     workers: Option<usize>,
     /// Largest upload, GB
