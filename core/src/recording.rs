@@ -62,7 +62,6 @@ mod entity {
     pub(super) const SPOTS: &str = "world/camera/image/spots";
     pub(super) const CORNERS: &str = "world/camera/image/corners";
     pub(super) const AREA: &str = "steps/effective_area";
-    pub(super) const AREA_SPOTS: &str = "steps/effective_area/spots";
     pub(super) const ONE_ROW: &str = "steps/one_row";
     pub(super) const ALL_ROWS: &str = "steps/all_rows";
     pub(super) const SHIFT: &str = "plots/shift";
@@ -283,7 +282,9 @@ fn halved(rgb: &[u8], width_px: u32, height_px: u32) -> Vec<u8> {
         ((at(0, 0) + at(0, 1) + at(1, 0) + at(1, 1) + 2) / 4) as u8
     };
     let rows = 0..height_px as usize / 2;
-    rows.flat_map(|r| (0..columns).flat_map(move |x| (0..3).map(move |c| (r, x, c)))).map(|(r, x, c)| mean(r, x, c)).collect()
+    rows.flat_map(|r| (0..columns).flat_map(move |x| (0..3).map(move |c| (r, x, c))))
+        .map(|(r, x, c)| mean(r, x, c))
+        .collect()
 }
 
 /// rerun's unit in space.

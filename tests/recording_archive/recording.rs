@@ -9,21 +9,23 @@ use stria_core::recording::{RecordedRun, Recorder, Segment};
 use super::known_run::KnownRun;
 use super::readers::read;
 
-const ENTITIES: [&str; 21] = [
+const ENTITIES: [&str; 23] = [
     "depth_image",
     "guide",
     "messages",
     "plots/rows_found",
     "plots/scale",
     "plots/shift",
+    "steps/all_rows/scale",
     "steps/all_rows/sheet",
     "steps/all_rows/threshold",
     "steps/effective_area",
-    "steps/effective_area/spots",
     "steps/one_row/gray",
+    "steps/one_row/scale",
     "steps/one_row/sheet",
     "steps/one_row/spot",
     "steps/one_row/threshold",
+    "steps/one_row/words",
     "world",
     "world/camera",
     "world/camera/image",
@@ -104,7 +106,10 @@ fn a_recording_holds_every_step_with_its_values() {
     let translation = &read["entities"]["world/camera"]["components"]["Transform3D:translation"];
     assert!((number(&translation["max"]) - 0.178).abs() < 1e-6, "2 mm a frame, in metres");
     // 5 images a second: every 6th of 90 frames.
-    assert_eq!(entities["world/camera/image"]["components"]["EncodedImage:blob"]["values"].as_u64().map(|n| n > 15_000), Some(true));
+    assert_eq!(
+        entities["world/camera/image"]["components"]["EncodedImage:blob"]["values"].as_u64().map(|n| n > 15_000),
+        Some(true)
+    );
     assert_eq!(entities["steps/effective_area"]["rows"], 15);
     let guide = read["entities"]["guide"]["components"]["TextDocument:text"]["text"].to_string();
     assert!(guide.contains("metres") && guide.contains("known run"), "{guide}");

@@ -422,10 +422,7 @@ fn fields(of: &[(&str, u32, NumericType)]) -> Vec<PackedElementField> {
 
 /// Not turned, at a position in metres.
 fn pose_at([x, y, z]: [f64; 3]) -> Pose {
-    Pose {
-        position: Some(Vector3 { x, y, z }),
-        orientation: Some(Quaternion { x: 0.0, y: 0.0, z: 0.0, w: 1.0 }),
-    }
+    Pose { position: Some(Vector3 { x, y, z }), orientation: Some(Quaternion { x: 0.0, y: 0.0, z: 0.0, w: 1.0 }) }
 }
 
 /// The schemas' unit of length.

@@ -54,7 +54,12 @@ struct Waiting {
 impl RrdStore {
     /// Starts a recording that `opening` opens: its store's info, its blueprint. Nothing is at `path` before
     /// [`RrdStore::finish`].
-    pub(super) fn create(id: StoreId, opening: Vec<LogMsg>, path: &Path, live: Option<LiveSegments>) -> Result<RrdStore> {
+    pub(super) fn create(
+        id: StoreId,
+        opening: Vec<LogMsg>,
+        path: &Path,
+        live: Option<LiveSegments>,
+    ) -> Result<RrdStore> {
         let mut file = encoder(path)?;
         for message in &opening {
             file.append(message).map_err(|e| failed(path, e))?;
