@@ -193,7 +193,7 @@ recipe! {
     recording: RecordingOptions {
         /// Largest size of the recording: past it, images and points become sparser, never the plots.
         budget_mb: f64 = 200.0, "MB", number(5.0, 2000.0);
-        /// Width of the recorded images.
+        /// Largest width of the recorded images: frames are shrunk to it or below by a whole number.
         image_width_px: u32 = 640, "px", whole(64, 4096);
         /// Images a second of the run.
         images_per_s: f64 = 5.0, "1/s", number(0.1, 240.0);

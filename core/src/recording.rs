@@ -62,7 +62,6 @@ mod entity {
     pub(super) const SPOTS: &str = "world/camera/image/spots";
     pub(super) const CORNERS: &str = "world/camera/image/corners";
     pub(super) const AREA: &str = "steps/effective_area";
-    pub(super) const AREA_SPOTS: &str = "steps/effective_area/spots";
     pub(super) const ONE_ROW: &str = "steps/one_row";
     pub(super) const ALL_ROWS: &str = "steps/all_rows";
     pub(super) const SHIFT: &str = "plots/shift";

@@ -9,21 +9,23 @@ use stria_core::recording::{RecordedRun, Recorder, Segment};
 use super::known_run::KnownRun;
 use super::readers::read;
 
-const ENTITIES: [&str; 21] = [
+const ENTITIES: [&str; 23] = [
     "depth_image",
     "guide",
     "messages",
     "plots/rows_found",
     "plots/scale",
     "plots/shift",
+    "steps/all_rows/scale",
     "steps/all_rows/sheet",
     "steps/all_rows/threshold",
     "steps/effective_area",
-    "steps/effective_area/spots",
     "steps/one_row/gray",
+    "steps/one_row/scale",
     "steps/one_row/sheet",
     "steps/one_row/spot",
     "steps/one_row/threshold",
+    "steps/one_row/words",
     "world",
     "world/camera",
     "world/camera/image",

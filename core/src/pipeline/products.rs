@@ -286,8 +286,6 @@ impl<'a> Products<'a> {
         for warning in progress.warnings() {
             archive.warning(warning)?;
         }
-        archive.attach("rig.toml", "application/toml", request.rig.to_toml().as_bytes())?;
-        archive.attach("recipe.toml", "application/toml", request.recipe.to_toml().as_bytes())?;
         let json = serde_json::to_vec_pretty(manifest).map_err(|e| Error::internal("archive", e))?;
         archive.attach("manifest.json", "application/json", &json)?;
         let preview = request.out_dir.join("preview.png");

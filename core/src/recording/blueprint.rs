@@ -5,7 +5,8 @@ use rerun::blueprint::{
     Spatial3DView, Tabs, TextDocumentView, TextLogView, TimePanel, TimeSeriesView, Vertical, components,
 };
 use rerun::datatypes::{Range2D, TimeRange, TimeRangeBoundary};
-use rerun::external::re_sdk_types::blueprint::archetypes::{VisibleTimeRanges, VisualBounds2D};
+use rerun::external::re_sdk_types::blueprint::archetypes::{TextLogColumns, VisibleTimeRanges, VisualBounds2D};
+use rerun::external::re_sdk_types::blueprint::datatypes::{TextLogColumn, TextLogColumnKind};
 use rerun::log::{Chunk, LogMsg};
 use rerun::{AsComponents, RecordingStreamBuilder, StoreId, TimePoint, Timeline};
 
@@ -13,7 +14,7 @@ use super::data::{FRAME, TIME, failed};
 use super::surface::DepthRange;
 use super::{charts, entity, images};
 use crate::error::Result;
-use crate::rig::Rig;
+use crate::rig::{LineDirection, Rig};
 
 /// The messages that open a recording: what it is, and its layout.
 pub(super) fn opening(id: &StoreId, name: &str, recorded_at: jiff::Timestamp) -> Result<Vec<LogMsg>> {
@@ -70,13 +71,19 @@ fn layout() -> (Blueprint, Vec<Extra>) {
         .with_origin(format!("/{}", entity::IMAGE));
     let area = Spatial2DView::new("Effective area: where the line may be").with_origin(format!("/{}", entity::AREA));
     let one_row = sheet(
-        Spatial2DView::new("One row: gray (green), threshold, spot").with_origin(format!("/{}", entity::ONE_ROW)),
+        Spatial2DView::new("One row: gray, threshold, spot").with_origin(format!("/{}", entity::ONE_ROW)),
         &mut extras,
     );
-    let all_rows =
-        sheet(Spatial2DView::new("Threshold of every row").with_origin(format!("/{}", entity::ALL_ROWS)), &mut extras);
+    let all_rows = sheet(Spatial2DView::new("All rows").with_origin(format!("/{}", entity::ALL_ROWS)), &mut extras);
     let plot =
         |name: &str, entity: &str| ContainerLike::from(TimeSeriesView::new(name).with_origin(format!("/{entity}")));
+
+    let warnings = ContainerLike::from(TextLogView::new("Warnings").with_origin(format!("/{}", entity::MESSAGES)));
+    let body = TextLogColumn { kind: TextLogColumnKind::Body, visible: true.into() };
+    extras.push(Extra {
+        path: format!("{}/TextLogColumns", view_path(&warnings)),
+        what: Box::new(TextLogColumns::update_fields().with_text_log_columns([body])),
+    });
 
     let left = Vertical::new([
         wall,
@@ -84,7 +91,7 @@ fn layout() -> (Blueprint, Vec<Extra>) {
             TextDocumentView::new("How to read this").with_origin(format!("/{}", entity::GUIDE)).into(),
             Vertical::new([
                 Spatial2DView::new("Depth image (at the end)").with_origin(format!("/{}", entity::DEPTH_IMAGE)).into(),
-                TextLogView::new("Warnings").with_origin(format!("/{}", entity::MESSAGES)).into(),
+                warnings,
             ])
             .with_row_shares(vec![3.0, 1.0])
             .into(),
@@ -154,21 +161,21 @@ pub(super) fn guide(rig: &Rig, run_name: &str, range: Option<DepthRange>) -> Str
         Some(r) => format!("from **red** (near, {:.0} mm) to **blue** (far, {:.0} mm)", r.near_mm, r.far_mm),
         None => "from **red** (near) to **blue** (far)".to_string(),
     };
-    let (line, row) = match rig.laser.line {
-        crate::rig::LineDirection::Vertical => ("upright", "row"),
-        crate::rig::LineDirection::Horizontal => ("level", "column"),
+    let (line, row, sideways) = match rig.laser.line {
+        LineDirection::Vertical => ("an upright", "row", "sideways"),
+        LineDirection::Horizontal => ("a level", "column", "up or down"),
     };
     let colour = serde_json::to_value(rig.laser.colour).ok().and_then(|v| v.as_str().map(str::to_string));
     let colour = colour.unwrap_or_default();
     format!(
         "# {run_name}\n\n\
-A camera and a {colour} laser move along a wall. The laser draws an {line} line on it; where the wall is nearer or \
-farther, the line moves sideways in the image. That shift, {row} by {row}, is the measurement.\n\n\
+A camera and a {colour} laser move along a wall. The laser draws {line} line on it; where the wall is nearer or \
+farther, the line moves {sideways} in the image. That shift, {row} by {row}, is the measurement.\n\n\
 **1. Camera frame.** Red dots: the laser line as found, one spot a {row}. Blue arrows: corners of the wall's own \
 pattern and where they went since the previous frame (drawn {flow:.0} times longer).\n\n\
 **2. Effective area.** Only the {colour} part of the image is searched, so that other lights do not count.\n\n\
 **3. One {row}.** Its brightness, the threshold, and the spot: the middle between the two crossings. The second tab \
-shows the threshold of every {row}.\n\n\
+shows the threshold of all {row}s.\n\n\
 **4. Shift.** The mean of the corners' flow says how far the image moved: *dx* along the travel, *dy* across it. \
 *Scale* above 1: the camera came closer. *Residual*: how well the corners agree. A gap means that the motion could \
 not be found.\n\n\

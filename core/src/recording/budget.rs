@@ -83,12 +83,12 @@ impl Budget {
     pub(super) fn new(budget_mb: f64) -> Budget {
         let bytes = budget_mb * BYTES_PER_MB;
         Budget {
-            images: Share::new(0.45 * bytes, 0.1),
-            surface: Share::new((0.25 * bytes).min(Self::SURFACE_MAX_BYTES), 0.15),
-            rows: Share::new(0.20 * bytes, 0.33),
+            images: Share::new(0.45 * bytes, 0.15),
+            surface: Share::new((0.25 * bytes).min(Self::SURFACE_MAX_BYTES), 0.25),
+            rows: Share::new(0.20 * bytes, 0.4),
             messages: Share::new(0.01 * bytes, 1.0),
             map: Share::new(0.05 * bytes, 1.0),
-            segments: Share::new(0.25 * bytes, 0.33),
+            segments: Share::new(0.25 * bytes, 0.4),
         }
     }
 }
@@ -116,13 +116,22 @@ mod tests {
     #[test]
     fn content_thins_out_and_still_reaches_the_end_of_a_long_run() {
         for steps in [10, 100, 1_000, 10_000, 100_000, 1_000_000] {
-            let mut share = Share::new(2000.0, 0.1);
+            let mut share = Share::new(2000.0, 0.2);
             let taken = taken(&mut share, steps);
             let last = taken.last().copied().unwrap_or_default();
-            assert!(f64::from(last) > 0.85 * f64::from(steps) - 1.0, "the last of {steps} is {last}: {taken:?}");
+            // Fifty times too much for the share is where it gets scarce.
+            let near_the_end = match steps {
+                ..=10_000 => 0.85,
+                ..=100_000 => 0.4,
+                _ => 0.1,
+            };
+            assert!(
+                f64::from(last) > near_the_end * f64::from(steps) - 1.0,
+                "the last of {steps} is {last}: {taken:?}"
+            );
             assert!(taken.iter().take(20).eq(&(0..20.min(steps)).collect::<Vec<_>>()), "the start is complete");
             if steps >= 1000 {
-                assert!(taken.len() > 80, "{} of 200 used for {steps}", taken.len());
+                assert!(taken.len() > 120, "{} of 200 used for {steps}", taken.len());
             }
         }
         assert!(!Share::new(100.0, 0.1).spend(101));
@@ -131,14 +140,14 @@ mod tests {
     #[test]
     fn a_known_length_is_evenly_dense() {
         for (steps, every) in [(99, 1), (100, 1), (101, 2), (799, 8), (12_800, 128)] {
-            let mut share = Share::new(2000.0, 0.1);
+            let mut share = Share::new(2000.0, 0.2);
             share.plan(10.0 * f64::from(steps));
             let taken = taken(&mut share, steps);
             assert!(taken.windows(2).all(|w| w[1] - w[0] == every), "{steps} steps: {taken:?}");
             assert!(taken.len() as u32 >= (steps - 1) / every);
         }
         // Longer than announced: it thins out from there on, and still fits.
-        let mut share = Share::new(2000.0, 0.1);
+        let mut share = Share::new(2000.0, 0.2);
         share.plan(1000.0);
         assert!(taken(&mut share, 100_000).len() > 150);
     }

@@ -4,7 +4,7 @@
 //! gray 0 at the bottom, 255 at the top.
 
 use rerun::log::Chunk;
-use rerun::{LineStrips2D, Radius};
+use rerun::{LineStrips2D, Points2D, Radius};
 
 use super::data::{fixed, row};
 use super::{FrameSteps, entity};
@@ -32,16 +32,29 @@ pub(super) fn opening() -> Result<Vec<Chunk>> {
     };
     let sheet =
         LineStrips2D::new([[[0.0, SHEET_HEIGHT], [SHEET_WIDTH, SHEET_HEIGHT]], [[0.0, 0.0], [SHEET_WIDTH, 0.0]]])
-            .with_colors([[110, 110, 110]])
-            .with_labels(["gray 0", "gray 255"]);
+            .with_colors([[110, 110, 110]]);
+    let scale = labels(&[([30.0, SHEET_HEIGHT - 30.0], "gray 0".into()), ([36.0, 4.0], "gray 255".into())])
+        .with_colors([[110, 110, 110]]);
     Ok(vec![
         fixed(&format!("{}/sheet", entity::ONE_ROW), &sheet)?,
+        fixed(&format!("{}/scale", entity::ONE_ROW), &scale)?,
         fixed(&format!("{}/sheet", entity::ALL_ROWS), &sheet)?,
-        fixed(&gray(), &style([120, 220, 120], 1.0))?,
-        fixed(&threshold(), &style([255, 170, 0], 0.8))?,
+        fixed(&format!("{}/scale", entity::ALL_ROWS), &scale)?,
+        fixed(&gray(), &style([80, 190, 80], 1.0))?,
+        fixed(&threshold(), &style([240, 150, 0], 0.8))?,
         fixed(&spot(), &style([255, 40, 40], 0.8))?,
-        fixed(&thresholds(), &style([255, 170, 0], 0.8))?,
+        fixed(&words(), &Points2D::update_fields().with_colors([[240, 150, 0], [255, 40, 40]]))?,
+        fixed(&thresholds(), &style([240, 150, 0], 0.8))?,
     ])
+}
+
+/// Words at their places on a sheet.
+fn labels(of: &[([f32; 2], String)]) -> Points2D {
+    Points2D::update_fields()
+        .with_positions(of.iter().map(|(place, _)| *place))
+        .with_labels(of.iter().map(|(_, words)| words.clone()))
+        .with_radii(of.iter().map(|_| Radius::new_ui_points(0.0)))
+        .with_show_labels(true)
 }
 
 fn gray() -> String {
@@ -56,6 +69,10 @@ fn spot() -> String {
     format!("{}/spot", entity::ONE_ROW)
 }
 
+fn words() -> String {
+    format!("{}/words", entity::ONE_ROW)
+}
+
 fn thresholds() -> String {
     format!("{}/threshold", entity::ALL_ROWS)
 }
@@ -64,42 +81,34 @@ fn thresholds() -> String {
 pub(super) fn show(steps: &FrameSteps<'_>, image: &Image) -> Result<Vec<Chunk>> {
     let Some(values) = steps.row_threshold else { return Ok(vec![]) };
     let at = steps.moment();
-    let strips = |strips: Vec<Vec<[f32; 2]>>, labels: Vec<String>| {
-        LineStrips2D::update_fields().with_strips(strips).with_labels(labels)
-    };
+    let strips = |strips: Vec<Vec<[f32; 2]>>| LineStrips2D::update_fields().with_strips(strips);
     let mut chunks = match middle_spot(steps.stripe, values) {
         Some((position, across_px)) => {
             let curve = gray_curve(image, steps.stripe.line, position, across_px);
-            let value = values[position];
+            let (level, x) = (SHEET_HEIGHT - values[position], curve.x(across_px));
             let (row_word, column_word) = match steps.stripe.line {
                 LineDirection::Vertical => ("row", "column"),
                 LineDirection::Horizontal => ("column", "row"),
             };
-            let level = SHEET_HEIGHT - value;
-            let x = curve.x(across_px);
+            let said = labels(&[
+                ([SHEET_WIDTH - 60.0, level + 3.0], format!("threshold {:.0}", values[position])),
+                ([x, SHEET_HEIGHT - 40.0], format!("{row_word} {position}: spot at {column_word} {across_px:.2}")),
+            ]);
             vec![
-                row(&gray(), at, &strips(vec![curve.strip()], vec![format!("{row_word} {position}")]))?,
-                row(
-                    &threshold(),
-                    at,
-                    &strips(vec![vec![[0.0, level], [SHEET_WIDTH, level]]], vec![format!("threshold {value:.0}")]),
-                )?,
-                row(
-                    &spot(),
-                    at,
-                    &strips(
-                        vec![vec![[x, 0.0], [x, SHEET_HEIGHT]]],
-                        vec![format!("spot: {column_word} {across_px:.2}")],
-                    ),
-                )?,
+                row(&gray(), at, &strips(vec![curve.strip()]))?,
+                row(&threshold(), at, &strips(vec![vec![[0.0, level], [SHEET_WIDTH, level]]]))?,
+                row(&spot(), at, &strips(vec![vec![[x, 0.0], [x, SHEET_HEIGHT]]]))?,
+                row(&words(), at, &said)?,
             ]
         }
-        None => [gray(), threshold(), spot()]
-            .iter()
-            .map(|entity| row(entity, at, &strips(vec![], vec![])))
-            .collect::<Result<_>>()?,
+        None => vec![
+            row(&gray(), at, &strips(vec![]))?,
+            row(&threshold(), at, &strips(vec![]))?,
+            row(&spot(), at, &strips(vec![]))?,
+            row(&words(), at, &labels(&[]))?,
+        ],
     };
-    chunks.push(row(&thresholds(), at, &strips(threshold_strips(values), vec![]))?);
+    chunks.push(row(&thresholds(), at, &strips(threshold_strips(values)))?);
     Ok(chunks)
 }
 

