@@ -227,5 +227,6 @@ fn log_to_stderr() {
     let filter = EnvFilter::try_from_env("STRIA_LOG").unwrap_or_else(|_| EnvFilter::new("info"));
     // A second subscriber in one process is a test's; the first stays.
     let terminal = std::io::stderr().is_terminal();
-    let _ = tracing_subscriber::fmt().with_env_filter(filter).with_writer(std::io::stderr).with_ansi(terminal).try_init();
+    let _ =
+        tracing_subscriber::fmt().with_env_filter(filter).with_writer(std::io::stderr).with_ansi(terminal).try_init();
 }
