@@ -108,7 +108,8 @@ pub fn router(app: App) -> Router {
     let (api, _) = routes().split_for_parts();
     let limits = app.config.requests.clone();
     api.route("/api/openapi.json", get(move || async move { Json(document.as_ref().clone()) }))
-        .route("/api", get(unknown).post(unknown))
+        .route("/api", axum::routing::any(unknown))
+        .route("/api/", axum::routing::any(unknown))
         .route("/api/{*rest}", axum::routing::any(unknown))
         .merge(page::routes())
         .method_not_allowed_fallback(wrong_method)

@@ -172,7 +172,8 @@ fn the_page_and_the_viewer_come_from_the_binary() {
 /// Asks a raw question; the answer's first line.
 fn raw(address: &str, request: &str) -> String {
     let mut stream = TcpStream::connect(address).expect("connects");
-    stream.write_all(request.as_bytes()).expect("sends");
+    // The server may refuse a long head before it has all of it.
+    let _ = stream.write_all(request.as_bytes());
     let mut answer = [0u8; 64];
     let read = stream.read(&mut answer).unwrap_or(0);
     String::from_utf8_lossy(&answer[..read]).lines().next().unwrap_or_default().to_string()

@@ -116,7 +116,7 @@ fn process_stops_when_asked_and_when_its_parent_dies() {
 fn send_waits_for_the_result_and_passes_on_what_went_wrong() {
     let server = Server::start(&["--workers", "1"]);
     let (video, rig, url) = (plain(&short_run().video), plain(&short_run().rig), server.url(""));
-    let send = |more: &[&str]| run_stria(&[&["send", video, "--server", &url, "--asset", "Wall"], more].concat());
+    let send = |more: &[&str]| run_stria(&[&["send", video, "--server", &url, "--asset", "Wall"][..], more].concat());
     let done = send(&["--rig", rig, "--chainage-mm", "-250", "--direction", "backward", "--wait"]);
     assert_eq!(done.status.code(), Some(0), "{}", words(&done.stderr));
     let said = words(&done.stdout);
@@ -134,7 +134,7 @@ fn send_waits_for_the_result_and_passes_on_what_went_wrong() {
         (vec!["--rig", rig, "--server", "https://127.0.0.1:1"], 2, "http://"),
     ] {
         let failed = if more.contains(&"--server") {
-            run_stria(&[&["send", video, "--asset", "Wall"], more.as_slice()].concat())
+            run_stria(&[&["send", video, "--asset", "Wall"][..], more.as_slice()].concat())
         } else {
             send(&more)
         };
@@ -159,15 +159,17 @@ fn serve_refuses_what_would_do_harm() {
 
     let folder = tempfile::tempdir().expect("folder");
     let data = plain(folder.path());
+    let url = server.url("");
+    let taken = url.trim_start_matches("http://");
     for (arguments, expected) in [
         (vec!["--listen", "0.0.0.0:0"], "--without-authentication"),
         (vec!["--listen", "[::]:0"], "--without-authentication"),
         (vec!["--listen", "nowhere"], "--listen"),
-        (vec!["--max-upload-gb", "-1"], "max-upload-gb"),
+        (vec!["--max-upload-gb", "0"], "max-upload-gb"),
         (vec!["--workers", "100000"], "1024"),
-        (vec!["--listen", &server.url("")["http://".len()..]], "expected a free address"),
+        (vec!["--listen", taken], "expected a free address"),
     ] {
-        let refused = run_stria(&[&["serve", "--data", data], arguments.as_slice()].concat());
+        let refused = run_stria(&[&["serve", "--data", data][..], arguments.as_slice()].concat());
         assert_eq!(refused.status.code(), Some(2), "{arguments:?}");
         assert!(words(&refused.stderr).contains(expected), "{arguments:?}: {}", words(&refused.stderr));
     }

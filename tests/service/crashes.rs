@@ -92,7 +92,7 @@ fn a_clean_stop_costs_no_attempt_and_leaves_no_child() {
 
 #[test]
 fn a_job_that_takes_too_long_or_too_much_fails_with_the_reason() {
-    // A thousandth of an hour is 3.6 s; this is 0.4 s.
+    // 0.36 s.
     let server = Server::start(&["--workers", "1", "--job-time-limit-h", "0.0001"]);
     let job = text(&server.upload(long_run(), "Wall"), "/job/id");
     let failed = server.wait_for_state(&job, "failed");

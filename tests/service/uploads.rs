@@ -20,7 +20,7 @@ fn a_form_and_a_raw_body_make_the_same_run() {
         ("recorded_at", "2026-05-17T10:30:00+02:00"),
         ("recipe", "paper-literal"),
         ("note", "after rain"),
-        ("rig", &rig),
+        ("rig", rig.as_str()),
     ];
     let body = form(&fields, "Süd \"7\".mp4", &video);
     let by_form = send(server.post("/api/runs").header("Content-Type", content_type()).body(body));
@@ -96,7 +96,7 @@ fn a_repeated_request_is_the_same_run() {
     let server = storing_server();
     let rig = short_run().rig_text();
     let request = |key: &str, asset: &str| {
-        let query = [("asset", asset), ("rig", &rig)];
+        let query = [("asset", asset), ("rig", rig.as_str())];
         server.post("/api/runs").query(&query).header("Idempotency-Key", key).body(short_run().video_bytes())
     };
     let first = json_of(send(request("k1", "Wall")), 201);
@@ -152,8 +152,10 @@ fn runs_are_paged_filtered_changed_and_deleted() {
     let rig = short_run().rig_text();
     for i in 0..5 {
         let day = format!("2026-05-1{i}T00:00:00Z");
+        let name = format!("r{i}.mp4");
         let asset = if i % 2 == 0 { "North 100%" } else { "South" };
-        let query = [("asset", asset), ("rig", &rig), ("recorded_at", &day), ("filename", &format!("r{i}.mp4"))];
+        let query =
+            [("asset", asset), ("rig", rig.as_str()), ("recorded_at", day.as_str()), ("filename", name.as_str())];
         json_of(send(server.post("/api/runs").query(&query).body("not yet a video")), 201);
     }
     let mut seen = Vec::new();
