@@ -251,7 +251,7 @@ mod tests {
             assert_eq!(steps.stripe.found(), HEIGHT as usize, "{colour:?}");
             let (rms, largest) = errors(&steps.stripe, 180.3);
             // Half a gray level of 250 on a slope of 8 % a pixel is 0.024 px at each of the two crossings.
-            assert!(rms < 0.015 && largest < 0.035, "{colour:?}: RMS {rms} px, largest {largest} px");
+            assert!(rms < 0.02 && largest < 0.035, "{colour:?}: RMS {rms} px, largest {largest} px");
         }
     }
 

@@ -15,6 +15,8 @@ pub fn form(fields: &[(&str, &str)], filename: &str, file: &[u8]) -> Vec<u8> {
         let part = format!("--{BOUNDARY}\r\nContent-Disposition: form-data; name=\"{name}\"\r\n\r\n{value}\r\n");
         body.extend_from_slice(part.as_bytes());
     }
+    // As browsers write it.
+    let filename = filename.replace('"', "%22");
     let head = format!(
         "--{BOUNDARY}\r\nContent-Disposition: form-data; name=\"file\"; filename=\"{filename}\"\r\n\
          Content-Type: video/mp4\r\n\r\n"

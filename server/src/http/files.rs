@@ -105,6 +105,8 @@ fn asked_range(asked: &HeaderMap, etag: &str, size: u64) -> Asked {
 /// backslash or foreign letter can break out of (RFC 6266).
 fn attachment(name: &str) -> String {
     let name = name.rsplit(['/', '\\']).next().unwrap_or_default();
+    // A name of dots alone would be a folder's.
+    let name = if name.trim_matches('.').is_empty() { "source" } else { name };
     let plain: String = name
         .chars()
         .map(|c| if c.is_ascii_alphanumeric() || matches!(c, '.' | '-' | '_' | ' ') { c } else { '_' })

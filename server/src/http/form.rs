@@ -6,6 +6,8 @@ use std::task::{Context, Poll};
 use std::time::Duration;
 
 use axum::body::BodyDataStream;
+use axum::http::HeaderMap;
+use axum::http::header::CONTENT_DISPOSITION;
 use bytes::Bytes;
 use futures::{Stream, StreamExt};
 
@@ -226,4 +228,43 @@ fn sha256(value: &str) -> Result<String> {
 fn printable(name: &str) -> String {
     let name: String = name.chars().filter(|c| !c.is_control()).take(MAX_NAME_CHARS).collect();
     if name.trim().is_empty() { "upload".into() } else { name }
+}
+
+/// The file's name as a part of a form gives it. Browsers write a quote in it as `%22`, other programs as `\"`.
+pub(super) fn given_name(headers: &HeaderMap) -> Option<String> {
+    let disposition = String::from_utf8_lossy(headers.get(CONTENT_DISPOSITION)?.as_bytes()).into_owned();
+    let quoted = disposition.split_once("filename=\"")?.1;
+    let mut name = String::new();
+    let mut characters = quoted.chars();
+    loop {
+        match characters.next()? {
+            '"' => break,
+            '\\' => match characters.next()? {
+                escaped @ ('"' | '\\') => name.push(escaped),
+                other => name.extend(['\\', other]),
+            },
+            other => name.push(other),
+        }
+    }
+    Some(name.replace("%22", "\"").replace("%0D", " ").replace("%0A", " "))
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn a_files_name_may_hold_quotes_and_backslashes() {
+        for (sent, name) in [
+            (r#"form-data; name="file"; filename="a.mp4""#, Some("a.mp4")),
+            (r#"form-data; name="file"; filename="a%22b.mp4""#, Some("a\"b.mp4")),
+            (r#"form-data; name="file"; filename="a\"b.mp4""#, Some("a\"b.mp4")),
+            (r#"form-data; name="file"; filename="C:\x\y.mp4""#, Some(r"C:\x\y.mp4")),
+            (r#"form-data; name="file"; filename="cut"#, None),
+            (r#"form-data; name="file""#, None),
+        ] {
+            let headers = [(CONTENT_DISPOSITION, sent.parse().expect("a value"))].into_iter().collect();
+            assert_eq!(given_name(&headers).as_deref(), name, "{sent}");
+        }
+    }
 }

@@ -7,7 +7,7 @@ use axum::response::{IntoResponse, Response};
 use serde::Serialize;
 
 use super::App;
-use super::form::{Body, Fields};
+use super::form::{self, Body, Fields};
 use crate::error::{Error, Result};
 use crate::incoming::{Incoming, Receiver};
 use crate::wire::{Problem, Run};
@@ -131,7 +131,7 @@ async fn receive_form(app: &App, parts: &axum::http::request::Parts, body: Body)
         if incoming.is_some() {
             return Err(Error::field("file", "the form has more than one file", "one part named 'file'"));
         }
-        fields.file_name(part.file_name());
+        fields.file_name(form::given_name(part.headers()).as_deref());
         let mut receiver = Receiver::start(&app.config.incoming(), limits.upload_bytes);
         while let Some(chunk) = next_chunk(&mut part, limits.sender_silence).await? {
             receiver.push(chunk).await?;
