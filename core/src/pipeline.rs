@@ -230,7 +230,7 @@ impl HeldFrame {
         let HeldFrame { frame, steps, profile, shift } = self;
         let middle_px = steps.stripe.median_px();
         let texture = middle_px.map(|px| TextureStrip::cut(&frame.image, line, px, step_px, offset_px));
-        let picture = products.wants_picture(frame.time_s).then(|| Picture {
+        let picture = products.wants_picture(frame.time_s).then_some(Picture {
             image: frame.image,
             effective_area: steps.effective_area,
             row_threshold: steps.row_threshold,

@@ -255,7 +255,7 @@ impl Camera {
     fn from_file(subject: &str, file: CameraFile) -> Result<Camera> {
         let bad = |field: &str, found: String, expected: &str| Err(Error::field(subject, field, found, expected));
         for (field, side) in [("camera.width_px", file.width_px), ("camera.height_px", file.height_px)] {
-            if side < 16 || side > MAX_IMAGE_SIDE_PX {
+            if !(16..=MAX_IMAGE_SIDE_PX).contains(&side) {
                 return bad(field, format!("{side} px"), "16 to 8192 px");
             }
         }
@@ -309,7 +309,7 @@ impl Camera {
             let pixel = RawPixel { u_px: u, v_px: v };
             let back = self.distort(self.undistort(pixel));
             let miss_px = (back.u_px - u).hypot(back.v_px - v);
-            if !(miss_px < 0.01) {
+            if miss_px.is_nan() || miss_px >= 0.01 {
                 return Err(Error::field(
                     subject,
                     "camera.distortion",

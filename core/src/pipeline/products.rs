@@ -148,7 +148,7 @@ impl<'a> Products<'a> {
     /// Hands tiles out while the run goes on, now and then, so that people can look.
     fn write_changed_tiles(&mut self) -> Result<()> {
         let (Some(map), Some(tiles)) = (&mut self.map, &mut self.tiles) else { return Ok(()) };
-        if self.frames % u64::from(self.request.recipe.map.tile_frames) != 0 {
+        if !self.frames.is_multiple_of(u64::from(self.request.recipe.map.tile_frames)) {
             return Ok(());
         }
         for index in map.take_changed() {

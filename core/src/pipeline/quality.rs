@@ -105,7 +105,7 @@ struct RunningMedian {
 impl RunningMedian {
     fn add(&mut self, value: f64) {
         self.every = self.every.max(1);
-        if self.seen % self.every == 0 {
+        if self.seen.is_multiple_of(self.every) {
             self.values.push(value);
         }
         self.seen += 1;
