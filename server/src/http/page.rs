@@ -32,7 +32,7 @@ const VIEWER_VERSION: &str = "0.36.3";
 
 /// What the page may do: ask this server, run its own scripts and the viewer's wasm, and nothing else.
 const PAGE_POLICY: &str = "default-src 'self'; script-src 'self' 'wasm-unsafe-eval'; connect-src 'self'; \
-    img-src 'self' blob: data:; style-src 'self' 'unsafe-inline'; worker-src 'self' blob:; frame-ancestors 'none'; \
+    img-src 'self' blob: data:; style-src 'self'; worker-src 'self' blob:; frame-ancestors 'none'; \
     base-uri 'none'; form-action 'self'";
 
 /// The page answers every address that is not the API's, because it has addresses of its own for runs and jobs.
