@@ -188,8 +188,8 @@ export const texts = {
     job: (recipe: string, rig: string) => `Recipe ${recipe}, rig ${rig}`,
     took: (time: string) => `took ${time}`,
     again: "Measure again with recipe",
-    withRig: "and",
-    sameRig: "the same rig",
+    withRig: "and rig",
+    sameRig: "as before",
     start: "Start",
   },
   log: {

@@ -12,7 +12,8 @@ export function ProblemBox({ problem, heading, onRetry, onDismiss, children }: P
       <p class="notice-title">{heading ?? problem.title}</p>
       {heading !== undefined && problem.title !== heading && <p>{problem.title}</p>}
       {problem.detail === "" ? <p>{texts.problem.unreachable}</p> : <p class="words">{problem.detail}</p>}
-      {problem.expected && (
+      {/* Some details say already what was expected. */}
+      {problem.expected && !problem.detail.includes(problem.expected) && (
         <p class="words">
           <strong>{texts.problem.expected}:</strong> {problem.expected}
         </p>
