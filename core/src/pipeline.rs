@@ -167,6 +167,7 @@ fn measure(
         // Source ▶ Frame ▶ Stripe, in a thread of their own.
         let (frames, reading) = reading::start(scope, source, rig, recipe);
         let mut held: Option<HeldFrame> = None;
+        let mut clear = ClearOfLine::new(recipe.motion.band_half_width_px);
         for seen in frames {
             let Seen { frame, steps } = seen?;
             // Stripe ▶ Profile.
@@ -177,7 +178,7 @@ fn measure(
             // Profile + motion ▶ surface. A frame's strip ends where the next one begins: it waits for that.
             let step_px = shift.travel_px(rig.laser.line);
             if let Some(before) = held.take() {
-                let measured = before.cut(rig.laser.line, step_px, recipe.motion.band_half_width_px, products);
+                let measured = before.cut(rig.laser.line, step_px, &mut clear, products);
                 add(placement.push(measured), products, quality, &mut timings, progress)?;
             }
             held = Some(HeldFrame { frame, steps, profile, shift });
@@ -185,7 +186,7 @@ fn measure(
         }
         if let Some(last) = held.take() {
             let step_px = last.shift.travel_px(rig.laser.line);
-            let measured = last.cut(rig.laser.line, step_px, recipe.motion.band_half_width_px, products);
+            let measured = last.cut(rig.laser.line, step_px, &mut clear, products);
             add(placement.push(measured), products, quality, &mut timings, progress)?;
         }
         add(placement.finish(), products, quality, &mut timings, progress)?;
@@ -226,10 +227,17 @@ struct HeldFrame {
 
 impl HeldFrame {
     /// Keeps what later stages need of the image and lets the rest go.
-    fn cut(self, line: LineDirection, step_px: f64, offset_px: f64, products: &Products<'_>) -> Measured<Cargo> {
+    fn cut(
+        self,
+        line: LineDirection,
+        step_px: f64,
+        clear: &mut ClearOfLine,
+        products: &Products<'_>,
+    ) -> Measured<Cargo> {
         let HeldFrame { frame, steps, profile, shift } = self;
         let middle_px = steps.stripe.median_px();
-        let texture = middle_px.map(|px| TextureStrip::cut(&frame.image, line, px, step_px, offset_px));
+        let texture =
+            middle_px.map(|px| TextureStrip::cut(&frame.image, line, px, step_px, clear.offsets_px(&steps.stripe, px)));
         let picture = products.wants_picture(frame.time_s).then_some(Picture {
             image: frame.image,
             effective_area: steps.effective_area,
@@ -237,6 +245,27 @@ impl HeldFrame {
         });
         let cargo = Cargo { stripe: steps.stripe, texture, picture };
         Measured { frame: frame.index, time_s: frame.time_s, profile, shift, cargo }
+    }
+}
+
+/// How far ahead of the line's middle and behind it no laser light was seen so far: on a pipe the line is bent.
+struct ClearOfLine {
+    margin_px: f64,
+    reach_px: [f64; 2],
+}
+
+impl ClearOfLine {
+    fn new(margin_px: f64) -> ClearOfLine {
+        ClearOfLine { margin_px, reach_px: [0.0; 2] }
+    }
+
+    /// Never shrinks, so that the strips of the texture join.
+    fn offsets_px(&mut self, stripe: &Stripe, middle_px: f64) -> [f64; 2] {
+        if let Some((low, high)) = stripe.extent_px() {
+            let reach_px = [f64::from(high) - middle_px, middle_px - f64::from(low)];
+            self.reach_px = [self.reach_px[0].max(reach_px[0]), self.reach_px[1].max(reach_px[1])];
+        }
+        self.reach_px.map(|reach| reach + self.margin_px)
     }
 }
 

@@ -2,7 +2,7 @@
 //!
 //! Depths come from the laser line, colours from two columns of the same frame beside the line, where no
 //! laser light falls: one ahead of it and one behind it on the travel. The one behind only fills what the
-//! one ahead could not reach (the run's first columns), so the line is never seen in the texture.
+//! one ahead could not reach (the run's first columns), so the line is not seen in the texture.
 
 use super::{Grid, SurfaceMap};
 use crate::error::Result;
@@ -17,16 +17,17 @@ pub struct TextureStrip {
     first: i64,
     columns: usize,
     rows: usize,
-    offset_px: i64,
+    /// How far ahead of the line and behind it the colours were taken, px.
+    offsets_px: [i64; 2],
     ahead: Vec<Option<[u8; 3]>>,
     behind: Vec<Option<[u8; 3]>>,
 }
 
 impl TextureStrip {
     /// Cuts the strip of a frame whose line lies at `line_px` (column, or row of a horizontal line) and
-    /// whose content moves by `step_px` of travel until the next frame; colours are taken `offset_px`
-    /// beside the line.
-    pub fn cut(image: &Image, line: LineDirection, line_px: f64, step_px: f64, offset_px: f64) -> TextureStrip {
+    /// whose content moves by `step_px` of travel until the next frame; colours are taken `offsets_px` ahead
+    /// of the line and behind it: far enough that a bent line's light does not reach there.
+    pub fn cut(image: &Image, line: LineDirection, line_px: f64, step_px: f64, offsets_px: [f64; 2]) -> TextureStrip {
         let reach = step_px.abs().ceil() as i64 + 1;
         let (first, last) = if step_px < 0.0 { (-reach, 1) } else { (-1, reach) };
         let columns = (last - first + 1) as usize;
@@ -34,12 +35,12 @@ impl TextureStrip {
             LineDirection::Vertical => image.height_px(),
             LineDirection::Horizontal => image.width_px(),
         } as usize;
-        let offset_px = offset_px.round() as i64;
-        let cut = |side: i64| {
-            let start = line_px.round() as i64 + side * offset_px + first;
+        let offsets_px = offsets_px.map(|offset| offset.round() as i64);
+        let cut = |offset_px: i64| {
+            let start = line_px.round() as i64 + offset_px + first;
             (0..rows).flat_map(|row| (0..columns).map(move |k| pixel(image, line, start + k as i64, row))).collect()
         };
-        TextureStrip { first, columns, rows, offset_px, ahead: cut(1), behind: cut(-1) }
+        TextureStrip { first, columns, rows, offsets_px, ahead: cut(offsets_px[0]), behind: cut(-offsets_px[1]) }
     }
 }
 
@@ -111,9 +112,10 @@ pub fn add_strip<T>(
         }
         for row in 0..strip.rows {
             let at = row * strip.columns + k as usize;
-            for (colours, side) in [(&strip.ahead, 1), (&strip.behind, -1)] {
+            let [ahead_px, behind_px] = strip.offsets_px;
+            for (colours, offset_px, replace) in [(&strip.ahead, ahead_px, true), (&strip.behind, -behind_px, false)] {
                 if let Some(rgb) = colours[at] {
-                    map.put_texture(column + side * strip.offset_px, grid_row(row as i64), rgb, side == 1)?;
+                    map.put_texture(column + offset_px, grid_row(row as i64), rgb, replace)?;
                 }
             }
         }
@@ -144,7 +146,7 @@ mod tests {
             point_in_camera: Point3::new(0.0, 0.0, 400.0 + f64::from(row)),
             confidence: 1.0,
         });
-        let cargo = Some(TextureStrip::cut(&image(), LineDirection::Vertical, 64.0, step_px, 20.0));
+        let cargo = Some(TextureStrip::cut(&image(), LineDirection::Vertical, 64.0, step_px, [20.0, 20.0]));
         Placed {
             measured: Measured {
                 frame,
