@@ -23,8 +23,9 @@ const LARGEST_COUNTED_JUMP_PX: f32 = 400.0;
 /// Ends of paths that are followed at once.
 const OPEN_ENDS: usize = 16;
 
-/// Two spots belong to one piece of the line when they lie no further apart than this per row between them.
-const PIECE_SLOPE_PX: f32 = 4.0;
+/// Two spots belong to one piece of the line when they lie no further apart than this per row between them:
+/// noise of the laser's colour in the dark jumps further, and so falls into pieces too short to be believed.
+const PIECE_SLOPE_PX: f32 = 1.5;
 /// Rows without a spot that do not end a piece.
 const PIECE_GAP_ROWS: usize = 3;
 
@@ -142,6 +143,15 @@ mod tests {
         let chosen = continuous(&rows, 12);
         let first = chosen[0].expect("a spot").across_px;
         assert!(chosen.iter().flatten().all(|c| c.across_px == first));
+    }
+
+    #[test]
+    fn noise_that_jumps_about_is_no_line() {
+        let jumps = [0.0, 2.5, -1.0, 3.0, 0.5, -2.0, 1.0, 4.0];
+        let rows: Vec<Vec<Candidate>> =
+            (0..100).map(|i| vec![spot(100.0 + if i < 40 { jumps[i % 8] } else { 0.2 * i as f32 }, 50.0)]).collect();
+        let chosen = continuous(&rows, 12);
+        assert!((0..100).all(|i| chosen[i].is_some() == (i >= 40)));
     }
 
     #[test]
