@@ -207,11 +207,7 @@ fn add(
     progress: &mut Progress<'_, '_>,
 ) -> Result<()> {
     for frame in placed {
-        quality.add(
-            &frame.measured,
-            frame.measured.cargo.stripe.across_px.len(),
-            frame.world_from_camera.translation.x,
-        );
+        quality.add(&frame.measured, &frame.measured.cargo.stripe, frame.world_from_camera.translation.x);
         timings.time("products", || products.add(&frame, progress))?;
     }
     Ok(())

@@ -76,7 +76,10 @@ pub struct Quality {
     pub frames_tracked: u64,
     /// Share of line positions with a spot, over all frames, 0 to 1.
     pub rows_found: f64,
-    /// Points measured.
+    /// Spots of the line found in the images.
+    #[serde(default)]
+    pub spots: u64,
+    /// Points measured: spots whose ray meets the laser plane in front of the camera.
     pub points: u64,
     /// Share of map pixels with a depth, 0 to 1.
     pub coverage: f64,

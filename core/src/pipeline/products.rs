@@ -365,6 +365,13 @@ fn hash_source(info: &SourceInfo, source_name: &str) -> Result<Vec<FileEntry>> {
 
 /// Says in words what the figures mean for a person.
 fn warn_of_quality(quality: &Quality, gaps: &[Gap], request: &Request, progress: &mut Progress<'_, '_>) -> Result<()> {
+    if quality.points == 0 && quality.spots > 0 {
+        return progress.warn(
+            "no point was measured: the laser line was found, but no ray to it meets the rig's laser plane in front of the \
+             camera; check that the rig is this run's, and the sign of its baseline"
+                .into(),
+        );
+    }
     if quality.points == 0 {
         let colour = format!("{:?}", request.rig.laser.colour).to_lowercase();
         return progress.warn(format!(

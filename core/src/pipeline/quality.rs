@@ -2,6 +2,7 @@
 
 use crate::export::manifest::{Gap, Quality, Resolution};
 use crate::rig::Rig;
+use crate::stripe::Stripe;
 use crate::surface::Measured;
 use crate::triangulation::{depth_step_mm, paper_constants, view_height_mm};
 
@@ -32,20 +33,23 @@ impl QualityCounter {
         }
     }
 
-    /// Counts a frame; `line_positions` is how many rows its stripe could have had, `x_mm` where it was placed.
-    pub(super) fn add<T>(&mut self, measured: &Measured<T>, line_positions: usize, x_mm: f64) {
+    /// Counts a frame with its stripe; `x_mm` is where it was placed.
+    pub(super) fn add<T>(&mut self, measured: &Measured<T>, stripe: &Stripe, x_mm: f64) {
         let quality = &mut self.quality;
         quality.frames += 1;
+        quality.spots += stripe.found() as u64;
         quality.points += measured.profile.points.len() as u64;
         quality.duration_s = measured.time_s;
         quality.travel_mm += (x_mm - self.last_x_mm).abs();
         self.last_x_mm = x_mm;
-        self.line_positions += line_positions as u64;
-        if let Some(z_mm) = measured.profile.median_z_mm() {
+        self.line_positions += stripe.across_px.len() as u64;
+        if stripe.found() > 0 {
             quality.frames_with_stripe += 1;
-            self.distance_mm.add(z_mm);
         } else {
             add_gap(&mut self.gaps, measured.frame, "no_stripe");
+        }
+        if let Some(z_mm) = measured.profile.median_z_mm() {
+            self.distance_mm.add(z_mm);
         }
         if measured.shift.dx_px.is_some() {
             quality.frames_tracked += 1;
@@ -61,7 +65,7 @@ impl QualityCounter {
     pub(super) fn finish(self, rig: &Rig, coverage: f64) -> (Quality, Vec<Gap>, Option<Resolution>) {
         let mut quality = self.quality;
         quality.coverage = coverage;
-        quality.rows_found = quality.points as f64 / self.line_positions.max(1) as f64;
+        quality.rows_found = quality.spots as f64 / self.line_positions.max(1) as f64;
         quality.residual_px = self.residual_px.median();
         let resolution = self.distance_mm.median().map(|z_mm| resolution(rig, z_mm, &quality));
         (quality, self.gaps, resolution)
