@@ -250,7 +250,8 @@ mod tests {
             let steps = find(&image, &laser(colour, LineDirection::Vertical), &StripeOptions::default()).expect("find");
             assert_eq!(steps.stripe.found(), HEIGHT as usize, "{colour:?}");
             let (rms, largest) = errors(&steps.stripe, 180.3);
-            // Half a gray level of 250 on a slope of 8 % a pixel is 0.024 px at each of the two crossings, at worst both the same way.
+            // Half a gray level of 250 on a slope of 8 % a pixel is 0.024 px at each of the two crossings, at
+            // worst both the same way.
             assert!(rms < 0.02 && largest < 0.05, "{colour:?}: RMS {rms} px, largest {largest} px");
         }
     }
