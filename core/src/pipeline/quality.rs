@@ -84,7 +84,7 @@ fn resolution(rig: &Rig, distance_mm: f64, quality: &Quality) -> Resolution {
         d_vertical_mm,
         r_vertical_mm: d_vertical_mm / f64::from(rig.camera.height_px),
         r_lateral_mm: (steps > 0).then(|| quality.travel_mm / steps as f64),
-        r_depth_mm: depth_step_mm(c1_mm_px, c2_px, distance_mm),
+        r_depth_mm: depth_step_mm(c1_mm_px, c2_px, distance_mm).abs(),
     }
 }
 
