@@ -70,7 +70,7 @@ pub fn run() -> ExitCode {
     let cli = Cli::parse();
     let outcome = match cli.command {
         Command::Process(command) => command.run(),
-        Command::Simulate(args) => simulate::run(&args).map(|()| Success::Done).map_err(Failed::from),
+        Command::Simulate(args) => simulate::run(&args).map(|()| Success::Done),
         Command::Serve(command) => command.run(),
         Command::Send(command) => command.run(),
         Command::Inspect(command) => command.run(),

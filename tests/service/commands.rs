@@ -113,6 +113,24 @@ fn process_stops_when_asked_and_when_its_parent_dies() {
 }
 
 #[test]
+fn a_simulation_that_is_interrupted_leaves_nothing() {
+    let folder = tempfile::tempdir().expect("a folder");
+    let out = folder.path().join("run");
+    let mut command = Command::new(stria());
+    command.args(["simulate", "wall", "--seconds", "60", "--out", plain(&out)]);
+    let mut process = command.stdout(Stdio::null()).stderr(Stdio::null()).spawn().expect("starts");
+    let begun = Instant::now();
+    let at_work = || std::fs::read_dir(folder.path()).expect("a folder").count() > 0;
+    while !at_work() && begun.elapsed() < Duration::from_secs(20) {
+        std::thread::sleep(Duration::from_millis(5));
+    }
+    assert!(at_work(), "it never began to write");
+    signal("INT", process.id());
+    assert_eq!(process.wait().expect("ends").code(), Some(130));
+    assert!(!at_work(), "nothing half-made stays");
+}
+
+#[test]
 fn send_waits_for_the_result_and_passes_on_what_went_wrong() {
     let server = Server::start(&["--workers", "1"]);
     let (video, rig, url) = (plain(&short_run().video), plain(&short_run().rig), server.url(""));

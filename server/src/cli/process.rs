@@ -169,7 +169,7 @@ fn say_json(line: &impl serde::Serialize) -> Result<(), Failed> {
 }
 
 /// The first Ctrl-C (or SIGTERM) stops between two frames, the second one at once.
-fn stop_on_signals(stop: Arc<AtomicBool>) -> Result<(), Failed> {
+pub(super) fn stop_on_signals(stop: Arc<AtomicBool>) -> Result<(), Failed> {
     let failed = |e: std::io::Error| Failed::Other(format!("signals cannot be heard: {e}"));
     let runtime = tokio::runtime::Builder::new_current_thread().enable_io().build().map_err(failed)?;
     let mut signals = {

@@ -3,12 +3,17 @@
 use std::io::IsTerminal;
 use std::ops::ControlFlow;
 use std::path::PathBuf;
+use std::sync::Arc;
+use std::sync::atomic::{AtomicBool, Ordering};
 
 use clap::{Args, ValueEnum};
 use indicatif::{ProgressBar, ProgressStyle};
 use stria_core::rig::{LaserColour, LineDirection};
 use stria_core::synthetic::{Motion, Output, Quality, SCENES, Scene, Simulation, write_run};
 use stria_core::{Error, Result};
+
+use super::Failed;
+use super::process::stop_on_signals;
 
 /// Makes a run with known truth: a video, its rig, its truth
 #[derive(Args, Debug)]
@@ -86,8 +91,11 @@ fn scene_list() -> String {
 /// Runs the command; the progress goes to the terminal's error stream.
 ///
 /// # Errors
-/// Unknown scenes, sizes, lengths and rates out of range, a folder that is not empty or cannot be written.
-pub(super) fn run(args: &SimulateArgs) -> Result<()> {
+/// Unknown scenes, sizes, lengths and rates out of range, a folder that is not empty or cannot be written; Ctrl-C,
+/// after which nothing is left behind.
+pub(super) fn run(args: &SimulateArgs) -> std::result::Result<(), Failed> {
+    let stop = Arc::new(AtomicBool::new(false));
+    stop_on_signals(stop.clone())?;
     let simulation = Simulation::new(scene(args)?, parse_size(&args.size)?, args.fps, args.seconds, args.seed)?;
     let output = match (args.frames, args.exact) {
         (true, _) => Output::Images,
@@ -97,7 +105,7 @@ pub(super) fn run(args: &SimulateArgs) -> Result<()> {
     let bar = progress_bar(u64::from(simulation.frames_total()));
     write_run(&simulation, &args.out, output, &mut |done, _| {
         bar.set_position(u64::from(done));
-        ControlFlow::Continue(())
+        if stop.load(Ordering::Relaxed) { ControlFlow::Break(()) } else { ControlFlow::Continue(()) }
     })?;
     bar.finish_and_clear();
     let frames = if args.frames { "frames/" } else { "video.mp4" };
