@@ -1,6 +1,6 @@
 //! The method against the truth of simulated runs: exact without noise, bounded with it.
 
-use stria_core::motion::ImageTracker;
+use stria_core::motion::paper::ImageTracker;
 use stria_core::recipe::Recipe;
 use stria_core::source::Frame;
 use stria_core::stripe::{self, Stripe};
@@ -35,7 +35,7 @@ fn measure(scene: Scene, size_px: (u32, u32), seconds: f64, seed: u64) -> Errors
     for index in 0..simulation.frames_total() {
         let (image, truth) = simulation.render(index);
         let frame = Frame { index, time_s: f64::from(index) / simulation.fps(), image };
-        let found = stripe::find(&frame.image, &rig.laser, &recipe.stripe).expect("stripe").stripe;
+        let found = stripe::paper::find(&frame.image, &rig.laser, &recipe.stripe).expect("stripe").stripe;
         for (row, across_px) in found.across_px.iter().enumerate() {
             let expected_px = truth.stripe_across_px[row];
             errors.measurable += usize::from(truth.measurable[row]);
@@ -87,6 +87,7 @@ fn the_true_stripe_gives_the_true_depth_to_0_02_mm() {
             let stripe = Stripe {
                 line: simulation.rig().laser.line,
                 confidence: vec![1.0; truth.stripe_across_px.len()],
+                sigma_px: vec![f32::NAN; truth.stripe_across_px.len()],
                 across_px: truth.stripe_across_px,
             };
             for point in &triangulate(&stripe, simulation.rig()).points {
@@ -135,7 +136,7 @@ fn without_a_laser_nothing_is_found() {
     let recipe = Recipe::load("paper").expect("built in");
     for index in 0..simulation.frames_total() {
         let (image, _) = simulation.render(index);
-        let found = stripe::find(&image, &simulation.rig().laser, &recipe.stripe).expect("stripe").stripe;
+        let found = stripe::paper::find(&image, &simulation.rig().laser, &recipe.stripe).expect("stripe").stripe;
         assert_eq!(found.found(), 0);
     }
 }

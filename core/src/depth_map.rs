@@ -4,6 +4,7 @@
 //! touched for long wait in a scratch file, so a long run needs no more memory than a short one.
 
 mod grid;
+pub mod sheet;
 pub mod strips;
 
 use std::collections::{HashMap, HashSet};
@@ -21,8 +22,8 @@ pub use grid::GridMap;
 pub const TILE_SIDE_PX: usize = 256;
 
 const TILE_PX: usize = TILE_SIDE_PX * TILE_SIDE_PX;
-/// A tile on disk: depth as float32, then red, green, blue and a flag a pixel.
-const TILE_BYTES: usize = TILE_PX * 8;
+/// A tile on disk: depth and its weight as float32, then red, green, blue and a flag a pixel.
+const TILE_BYTES: usize = TILE_PX * 12;
 
 /// Where a map lies: pixel (0, 0)'s centre is at (x0, y0) in the world; columns run along +x, rows along +y.
 #[derive(Clone, Copy, Debug, PartialEq, Serialize, Deserialize)]
@@ -103,6 +104,17 @@ pub struct Grid {
     pub mm_per_px: f64,
 }
 
+/// What is put on a grid pixel.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub struct Cell {
+    /// World z, mm.
+    pub depth_mm: f32,
+    /// Above 0.
+    pub weight: f32,
+    /// Red, green, blue of the visible image, where it is known.
+    pub rgb: Option<[u8; 3]>,
+}
+
 /// The depth map and the texture map of a run, on one grid.
 pub struct SurfaceMap {
     grid: Grid,
@@ -123,6 +135,8 @@ pub type TileIndex = (i64, i64);
 
 struct Tile {
     depth_mm: Vec<f32>,
+    /// What the depths weigh so far: 0 where nothing was measured.
+    weight: Vec<f32>,
     /// Red, green, blue, and 1 where there is an image.
     texture: Vec<[u8; 4]>,
     used: u64,
@@ -131,7 +145,7 @@ struct Tile {
 }
 
 impl SurfaceMap {
-    /// An empty map that holds `tiles_in_memory` tiles (half a megabyte each) and keeps the others in an
+    /// An empty map that holds `tiles_in_memory` tiles (three quarters of a megabyte each) and keeps the others in an
     /// unnamed file in `scratch_dir`.
     pub fn create(grid: Grid, tiles_in_memory: usize, scratch_dir: &Path) -> Result<SurfaceMap> {
         let scratch = tempfile::tempfile_in(scratch_dir).map_err(|e| Error::io(scratch_dir, e))?;
@@ -154,14 +168,49 @@ impl SurfaceMap {
         let (index, at) = place(column, row);
         let tile = self.tile(index)?;
         let was_empty = tile.depth_mm[at].is_nan();
-        tile.depth_mm[at] = depth_mm;
+        (tile.depth_mm[at], tile.weight[at]) = (depth_mm, 1.0);
         tile.dirty = true;
         self.changed.insert(index);
         self.measured += u64::from(was_empty);
-        let (columns, rows) = self.bounds.get_or_insert(([column, column], [row, row]));
-        *columns = [columns[0].min(column), columns[1].max(column)];
-        *rows = [rows[0].min(row), rows[1].max(row)];
+        self.reach([column, column], row);
         Ok(())
+    }
+
+    /// Puts cells side by side from a grid pixel on, along +x: a depth becomes the weighted mean of all that were put
+    /// there, the first colour stays.
+    pub fn blend_run(&mut self, column: i64, row: i64, cells: &[Cell]) -> Result<()> {
+        let mut done = 0;
+        while done < cells.len() {
+            let (index, at) = place(column + done as i64, row);
+            let room = TILE_SIDE_PX - at % TILE_SIDE_PX;
+            let part = &cells[done..(done + room).min(cells.len())];
+            let tile = self.tile(index)?;
+            let mut new = 0;
+            for (at, cell) in (at..).zip(part) {
+                let (depth, weight) = (&mut tile.depth_mm[at], &mut tile.weight[at]);
+                new += u64::from(depth.is_nan());
+                *weight += cell.weight;
+                *depth = if depth.is_nan() { cell.depth_mm } else { *depth + (cell.depth_mm - *depth) * cell.weight / *weight };
+                if let (Some([red, green, blue]), [.., 0]) = (cell.rgb, tile.texture[at]) {
+                    tile.texture[at] = [red, green, blue, 1];
+                }
+            }
+            tile.dirty = true;
+            self.changed.insert(index);
+            self.measured += new;
+            done += part.len();
+        }
+        if !cells.is_empty() {
+            self.reach([column, column + cells.len() as i64 - 1], row);
+        }
+        Ok(())
+    }
+
+    /// Widens the bounds of what was measured.
+    fn reach(&mut self, [first, last]: [i64; 2], row: i64) {
+        let (columns, rows) = self.bounds.get_or_insert(([first, last], [row, row]));
+        *columns = [columns[0].min(first), columns[1].max(last)];
+        *rows = [rows[0].min(row), rows[1].max(row)];
     }
 
     /// Puts a colour on a grid pixel that has none, or on any with `replace`.
@@ -258,6 +307,7 @@ impl SurfaceMap {
             let slot = *self.slots.entry(index).or_insert(next);
             let mut bytes = Vec::with_capacity(TILE_BYTES);
             bytes.extend(tile.depth_mm.iter().flat_map(|z| z.to_le_bytes()));
+            bytes.extend(tile.weight.iter().flat_map(|w| w.to_le_bytes()));
             bytes.extend(tile.texture.iter().flatten());
             self.scratch
                 .write_all_at(&bytes, slot * TILE_BYTES as u64)
@@ -271,9 +321,12 @@ impl SurfaceMap {
         self.scratch
             .read_exact_at(&mut bytes, slot * TILE_BYTES as u64)
             .map_err(|e| Error::io(&self.scratch_path, e))?;
-        let (depth, texture) = bytes.split_at(TILE_PX * 4);
+        let (depth, rest) = bytes.split_at(TILE_PX * 4);
+        let (weight, texture) = rest.split_at(TILE_PX * 4);
+        let floats = |bytes: &[u8]| bytes.chunks_exact(4).map(|b| f32::from_le_bytes([b[0], b[1], b[2], b[3]])).collect();
         Ok(Tile {
-            depth_mm: depth.chunks_exact(4).map(|b| f32::from_le_bytes([b[0], b[1], b[2], b[3]])).collect(),
+            depth_mm: floats(depth),
+            weight: floats(weight),
             texture: texture.chunks_exact(4).map(|b| [b[0], b[1], b[2], b[3]]).collect(),
             used: 0,
             dirty: false,
@@ -283,7 +336,13 @@ impl SurfaceMap {
 
 impl Tile {
     fn empty() -> Tile {
-        Tile { depth_mm: vec![f32::NAN; TILE_PX], texture: vec![[0; 4]; TILE_PX], used: 0, dirty: false }
+        Tile {
+            depth_mm: vec![f32::NAN; TILE_PX],
+            weight: vec![0.0; TILE_PX],
+            texture: vec![[0; 4]; TILE_PX],
+            used: 0,
+            dirty: false,
+        }
     }
 }
 

@@ -1,32 +1,35 @@
 //! The order of the stages: a source in, products out. Progress leaves as events; a stop comes back.
 
+mod colours;
 mod folder;
+mod metric;
+mod paper;
 mod products;
 mod progress;
 mod quality;
 mod reading;
+mod recent;
 
 use std::collections::BTreeMap;
 use std::path::PathBuf;
+use std::sync::Arc;
 use std::time::{Duration, Instant};
 
 use serde::{Deserialize, Serialize};
 
+use crate::depth_map::sheet::WallColours;
 use crate::depth_map::strips::TextureStrip;
-use crate::error::{Error, Result};
+use crate::error::Result;
 use crate::export::manifest::Manifest;
-use crate::motion::{ImageTracker, Shift};
-use crate::recipe::Recipe;
-use crate::rig::{LineDirection, Rig};
-use crate::source::{self, Frame, Image, Source, SourceInfo};
-use crate::stripe::{Stripe, StripeSteps};
-use crate::surface::{Measured, Placed, Placement};
-use crate::triangulation::{Profile, triangulate};
+use crate::recipe::{Method, Recipe};
+use crate::rig::Rig;
+use crate::source::{self, Image, Source, SourceInfo};
+use crate::stripe::Stripe;
+use crate::surface::Placed;
 use folder::ProductFolder;
 use products::Products;
 use progress::Progress;
 use quality::QualityCounter;
-use reading::Seen;
 
 /// A group of products that `--only` can name.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Hash, Serialize, Deserialize)]
@@ -147,137 +150,69 @@ fn measure_and_write(
 ) -> Result<Manifest> {
     let mut products = Products::create(request, info)?;
     let mut quality = QualityCounter::new();
-    let timings = measure(request, source, &mut products, &mut quality, progress)?;
+    let mut run = Run { request, products: &mut products, quality: &mut quality, progress, timings: Timings::default() };
+    match request.recipe.method {
+        Method::Metric => metric::measure(&mut run, source)?,
+        Method::Paper => paper::measure(&mut run, source)?,
+    }
+    let timings = run.timings;
     products.finish(info, quality, timings, progress)
 }
 
-/// The order of the stages, frame by frame.
-fn measure(
-    request: &Request,
-    source: Box<dyn Source>,
-    products: &mut Products<'_>,
-    quality: &mut QualityCounter,
-    progress: &mut Progress<'_, '_>,
-) -> Result<Timings> {
-    let (rig, recipe) = (&request.rig, &request.recipe);
-    let mut timings = Timings::default();
-    let mut tracker = ImageTracker::new(&recipe.motion);
-    let mut placement = Placement::new(rig, &recipe.motion);
-    std::thread::scope(|scope| {
-        // Source ▶ Frame ▶ Stripe, in a thread of their own.
-        let (frames, reading) = reading::start(scope, source, rig, recipe);
-        let mut held: Option<HeldFrame> = None;
-        let mut clear = ClearOfLine::new(recipe.motion.band_half_width_px);
-        for seen in frames {
-            let Seen { frame, steps } = seen?;
-            // Stripe ▶ Profile.
-            let profile = timings.time("triangulation", || triangulate(&steps.stripe, rig));
-            // Frames ▶ motion.
-            let shift = timings.time("motion", || tracker.track(&frame, &steps.stripe))?;
-            products.stripe(&steps.stripe)?;
-            // Profile + motion ▶ surface. A frame's strip ends where the next one begins: it waits for that.
-            let step_px = shift.travel_px(rig.laser.line);
-            if let Some(before) = held.take() {
-                let measured = before.cut(rig.laser.line, step_px, &mut clear, products);
-                add(placement.push(measured), products, quality, &mut timings, progress)?;
-            }
-            held = Some(HeldFrame { frame, steps, profile, shift });
-            progress.frame()?;
+/// A job at work: what every stage's results go to.
+struct Run<'a, 'r, 'o, 'p> {
+    request: &'r Request,
+    products: &'a mut Products<'r>,
+    quality: &'a mut QualityCounter,
+    progress: &'a mut Progress<'o, 'p>,
+    timings: Timings,
+}
+
+impl Run<'_, '_, '_, '_> {
+    /// Surface ▶ maps, cloud, recording, archive.
+    fn add(&mut self, placed: impl IntoIterator<Item = Placed<Cargo>>) -> Result<()> {
+        for frame in placed {
+            self.quality.add(&frame, &frame.measured.cargo.stripe);
+            self.timings.time("products", || self.products.add(&frame, self.progress))?;
         }
-        if let Some(last) = held.take() {
-            let step_px = last.shift.travel_px(rig.laser.line);
-            let measured = last.cut(rig.laser.line, step_px, &mut clear, products);
-            add(placement.push(measured), products, quality, &mut timings, progress)?;
-        }
-        add(placement.finish(), products, quality, &mut timings, progress)?;
-        let report = reading.join().map_err(|_| Error::internal("source", "the reading thread panicked"))?;
-        timings.add("decoding", report.decoding);
-        timings.add("stripe", report.stripes);
-        report.warnings.into_iter().try_for_each(|warning| progress.warn(warning))
-    })?;
-    Ok(timings)
-}
-
-/// Surface ▶ maps, cloud, recording, archive.
-fn add(
-    placed: Vec<Placed<Cargo>>,
-    products: &mut Products<'_>,
-    quality: &mut QualityCounter,
-    timings: &mut Timings,
-    progress: &mut Progress<'_, '_>,
-) -> Result<()> {
-    for frame in placed {
-        quality.add(&frame.measured, &frame.measured.cargo.stripe, frame.world_from_camera.translation.x);
-        timings.time("products", || products.add(&frame, progress))?;
-    }
-    Ok(())
-}
-
-/// A frame that waits for the next one's shift.
-struct HeldFrame {
-    frame: Frame,
-    steps: StripeSteps,
-    profile: Profile,
-    shift: Shift,
-}
-
-impl HeldFrame {
-    /// Keeps what later stages need of the image and lets the rest go.
-    fn cut(
-        self,
-        line: LineDirection,
-        step_px: f64,
-        clear: &mut ClearOfLine,
-        products: &Products<'_>,
-    ) -> Measured<Cargo> {
-        let HeldFrame { frame, steps, profile, shift } = self;
-        let middle_px = steps.stripe.median_px();
-        let texture =
-            middle_px.map(|px| TextureStrip::cut(&frame.image, line, px, step_px, clear.offsets_px(&steps.stripe, px)));
-        let picture = products.wants_picture(frame.time_s).then_some(Picture {
-            image: frame.image,
-            effective_area: steps.effective_area,
-            row_threshold: steps.row_threshold,
-        });
-        let cargo = Cargo { stripe: steps.stripe, texture, picture };
-        Measured { frame: frame.index, time_s: frame.time_s, profile, shift, cargo }
-    }
-}
-
-/// How far ahead of the line's middle and behind it no laser light was seen so far: on a pipe the line is bent.
-struct ClearOfLine {
-    margin_px: f64,
-    reach_px: [f64; 2],
-}
-
-impl ClearOfLine {
-    fn new(margin_px: f64) -> ClearOfLine {
-        ClearOfLine { margin_px, reach_px: [0.0; 2] }
-    }
-
-    /// Never shrinks, so that the strips of the texture join.
-    fn offsets_px(&mut self, stripe: &Stripe, middle_px: f64) -> [f64; 2] {
-        if let Some((low, high)) = stripe.extent_px() {
-            let reach_px = [f64::from(high) - middle_px, middle_px - f64::from(low)];
-            self.reach_px = [self.reach_px[0].max(reach_px[0]), self.reach_px[1].max(reach_px[1])];
-        }
-        self.reach_px.map(|reach| reach + self.margin_px)
+        Ok(())
     }
 }
 
 /// What travels with a frame through the placement.
 struct Cargo {
     stripe: Stripe,
-    texture: Option<TextureStrip>,
+    colours: Colours,
     /// Only for the frames whose picture the recording shows.
     picture: Option<Picture>,
 }
 
 /// A frame as the recording shows it.
 struct Picture {
-    image: Image,
-    effective_area: Vec<u8>,
-    row_threshold: Vec<f32>,
+    image: Arc<Image>,
+    effective_area: Option<Vec<u8>>,
+    row_threshold: Option<Vec<f32>>,
+}
+
+/// The wall's colours at a frame's profile.
+enum Colours {
+    /// Not known.
+    Unknown,
+    /// The publication's strips.
+    Strip(TextureStrip),
+    /// Between this profile and the one before.
+    Wall(WallColours),
+}
+
+impl Colours {
+    /// The colour at a line position; mid gray where it is not known.
+    fn at(&self, line_position: u32) -> [u8; 3] {
+        match self {
+            Colours::Unknown => [128; 3],
+            Colours::Strip(strip) => strip.beside(line_position),
+            Colours::Wall(wall) => wall.at(line_position, 1.0).unwrap_or([128; 3]),
+        }
+    }
 }
 
 /// Seconds of work per stage.

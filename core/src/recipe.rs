@@ -7,9 +7,10 @@ use serde::{Deserialize, Serialize};
 use serde_json::Value;
 
 use crate::error::{Error, Result};
+use crate::stripe::SpotChoice;
 
 /// The built-in recipes, the default first.
-pub const BUILT_IN: [&str; 2] = ["paper", "paper-literal"];
+pub const BUILT_IN: [&str; 3] = ["metric", "paper", "paper-literal"];
 
 /// What values an option takes.
 #[derive(Clone, Debug, PartialEq, Serialize)]
@@ -52,8 +53,10 @@ pub struct OptionInfo {
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(rename_all = "lowercase")]
 pub enum Method {
-    /// The publication, step by step (METHOD.md).
+    /// Everything in millimetres: calibrated light, full 3D poses, a metric grid.
     #[default]
+    Metric,
+    /// The publication, step by step (METHOD.md).
     Paper,
 }
 
@@ -63,6 +66,10 @@ fn number(min: f64, max: f64) -> Range {
 
 fn whole(min: u32, max: u32) -> Range {
     Range::Number { min: f64::from(min), max: f64::from(max), whole: true }
+}
+
+fn choice(of: &[&'static str]) -> Range {
+    Range::Choice { of: of.to_vec() }
 }
 
 fn flag() -> Range {
@@ -130,7 +137,42 @@ macro_rules! recipe {
 }
 
 recipe! {
-    /// How the laser line is found in a frame (METHOD.md, "Spot centroid").
+    /// How the laser line is found in a frame (method `metric`).
+    spot: SpotOptions {
+        /// Which of several spots in a row is the line: the one that continues the line (default), the strongest, or
+        /// the first or last across the image.
+        choice: SpotChoice = SpotChoice::Continuous, "", choice(&["continuous", "strongest", "first", "last"]);
+        /// Least difference between the line's colour and its surroundings, chroma levels. Lower finds fainter lines,
+        /// and more of other lights.
+        evidence_min: f64 = 2.5, "of 255", number(0.1, 128.0);
+        /// Least brightness of a spot above its surroundings, as a share of full light on a dark wall; more on a bright one.
+        contrast_min: f64 = 6.0, "of 255", number(0.0, 255.0);
+        /// Shortest continuous piece of the line that is believed.
+        piece_min_rows: u32 = 12, "rows", whole(1, 1000);
+        /// Divide the line's light by the same strip of wall as an earlier frame saw it without the laser.
+        wall_reference: bool = true, "", flag();
+        /// Change of the line's slope from one row to the next that the smoothing along the line expects. Smaller is
+        /// smoother; a very rough wall wants more.
+        bend_px: f64 = 0.002, "px a row", number(0.00001, 1.0);
+        /// Rows that are less sure than this are left out.
+        sigma_max_px: f64 = 2.0, "px", number(0.01, 100.0);
+    }
+    /// How the camera's pose is found (method `metric`).
+    pose: PoseOptions {
+        /// Places on the wall that are followed, about; one per cell of a grid over the image.
+        landmarks: u32 = 110, "", whole(12, 2000);
+        /// Least texture of such a place: the weaker direction's mean squared slope of the luma.
+        texture_min: f64 = 2.0, "levels² a px²", number(0.0, 10000.0);
+        /// Travel of the image from one key frame to the next, as a share of its width.
+        keyframe_share: f64 = 0.1, "of the width", number(0.01, 0.5);
+        /// Key frames whose poses are still adjusted together; each frame waits until its key frames are settled.
+        window: u32 = 7, "key frames", whole(2, 30);
+        /// Most frames that wait for that: a robot that stands still must not fill the memory.
+        waiting_max: u32 = 600, "frames", whole(2, 10000);
+        /// Frames without motion found, one after the other, after which the way is taken to be broken.
+        lost_max: u32 = 15, "frames", whole(1, 1000);
+    }
+    /// How the laser line is found in a frame (method `paper`; METHOD.md, "Spot centroid").
     stripe: StripeOptions {
         /// Moves the laser colour's hue range (green 50 to 100, red 170 to 10, blue 100 to 130; OpenCV's half
         /// degrees). Change it for a laser of unusual wavelength or a camera with a strong tint.
@@ -161,7 +203,7 @@ recipe! {
         /// Write the stripes of every frame to `stripes.npy`.
         keep: bool = false, "", flag();
     }
-    /// How the image's motion is found (METHOD.md, "Image motion").
+    /// How the image's motion is found (method `paper`; METHOD.md, "Image motion").
     motion: MotionOptions {
         /// Number of Harris corners that are followed from each frame to the next.
         corners: u32 = 100, "", whole(8, 2000);
@@ -185,7 +227,12 @@ recipe! {
     /// The maps.
     map: MapOptions {
         /// Map tiles held in memory; older ones wait on disk.
-        tiles_in_memory: u32 = 128, "", whole(16, 100000);
+        tiles_in_memory: u32 = 48, "", whole(16, 100000);
+        /// Size of a map pixel (method `metric`); 0 takes what the geometry supports: the distance of two image rows on
+        /// the wall, rounded up to 1, 2 or 5 times a power of ten.
+        mm_per_px: f64 = 0.0, "mm", number(0.0, 1000.0);
+        /// Widest gap between two profiles that the map fills (method `metric`); what is wider stays a hole.
+        bridge_mm: f64 = 25.0, "mm", number(0.0, 10000.0);
         /// Frames after which changed tiles are written while the run goes on.
         tile_frames: u32 = 120, "frames", whole(1, 100000);
     }
@@ -213,9 +260,10 @@ impl Recipe {
     /// A built-in recipe by name.
     pub fn built_in(name: &str) -> Option<Recipe> {
         match name {
-            "paper" => Some(Recipe::default()),
+            "metric" => Some(Recipe::default()),
+            "paper" => Some(Recipe { method: Method::Paper, ..Recipe::default() }),
             "paper-literal" => {
-                let mut recipe = Recipe::default();
+                let mut recipe = Recipe { method: Method::Paper, ..Recipe::default() };
                 recipe.stripe.erode_width_px = 50;
                 recipe.stripe.restore_height = false;
                 Some(recipe)
@@ -258,7 +306,7 @@ impl Recipe {
     pub fn set(&mut self, key: &str, text: &str) -> Result<()> {
         if key == "method" {
             self.method = serde_json::from_value(Value::from(text))
-                .map_err(|_| Error::field("--set", key, format!("'{text}'"), "paper"))?;
+                .map_err(|_| Error::field("--set", key, format!("'{text}'"), "metric or paper"))?;
             return Ok(());
         }
         let Some(option) = options().into_iter().find(|o| o.key == key) else {

@@ -222,6 +222,16 @@ impl Rig {
         }
     }
 
+    /// Depth that one pixel across the line stands for at distance `z_mm`, mm: z²/C1 (METHOD.md, equation (18)).
+    pub fn depth_step_mm(&self, z_mm: f64) -> f64 {
+        let normal = self.laser.plane.normal;
+        let (across, f_px) = match self.laser.line {
+            LineDirection::Vertical => (normal.x, self.camera.fx_px),
+            LineDirection::Horizontal => (normal.y, self.camera.fy_px),
+        };
+        (z_mm * z_mm * across / (f_px * self.laser.plane.offset_mm)).abs()
+    }
+
     /// Refuses images that this rig was not calibrated for; `subject` names the source.
     pub fn check_image_size(&self, subject: &str, width_px: u32, height_px: u32) -> Result<()> {
         let camera = &self.camera;

@@ -88,9 +88,10 @@ pub fn add_strip<T>(
     placed: &Placed<T>,
     texture: Option<&TextureStrip>,
 ) -> Result<()> {
-    let start = placed.travel_px.round() as i64;
-    let end = placed.travel_end_px.round() as i64;
-    let across = placed.across_px.round() as i64;
+    let Some(place) = placed.strip else { return Ok(()) };
+    let start = place.travel_px.round() as i64;
+    let end = place.travel_end_px.round() as i64;
+    let across = place.across_px.round() as i64;
     let (low, high) = (start.min(end), start.max(end));
     // The first frame always shows, also when nothing moves after it.
     let high = if placed.measured.frame == 0 { high.max(low + 1) } else { high };
@@ -99,7 +100,7 @@ pub fn add_strip<T>(
         LineDirection::Horizontal => across - line_position,
     };
     for point in &placed.measured.profile.points {
-        let depth_mm = (point.point_in_camera.z * placed.depth_factor) as f32;
+        let depth_mm = (point.point_in_camera.z * place.depth_factor) as f32;
         for column in low..high {
             map.put_depth(column, grid_row(i64::from(point.line_position)), depth_mm)?;
         }
@@ -130,6 +131,7 @@ mod tests {
     use crate::motion::Shift;
     use crate::rig::LaserColour;
     use crate::surface::Measured;
+    use crate::surface::paper::StripPlace;
     use crate::triangulation::{Profile, ProfilePoint};
     use nalgebra::Point3;
 
@@ -155,11 +157,15 @@ mod tests {
                 shift: Shift::default(),
                 cargo,
             },
-            travel_px,
-            travel_end_px: travel_px + step_px,
-            across_px: 0.0,
-            depth_factor: 1.0,
-            world_from_camera: nalgebra::Isometry3::identity(),
+            world_from_camera: Some(nalgebra::Isometry3::identity()),
+            degrees_of_freedom: 3,
+            part: 0,
+            strip: Some(StripPlace {
+                travel_px,
+                travel_end_px: travel_px + step_px,
+                across_px: 0.0,
+                depth_factor: 1.0,
+            }),
         }
     }
 

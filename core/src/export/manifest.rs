@@ -74,6 +74,15 @@ pub struct Quality {
     pub frames_with_stripe: u64,
     /// Frames whose motion was found (of all but the first).
     pub frames_tracked: u64,
+    /// Frames whose whole pose was measured: three positions and three angles.
+    #[serde(default)]
+    pub frames_6_dof: u64,
+    /// Frames of which only the position was measured: the angles are the starting ones.
+    #[serde(default)]
+    pub frames_3_dof: u64,
+    /// Breaks of the way: places where the motion was lost so long that the surface begins anew after them.
+    #[serde(default)]
+    pub breaks: u32,
     /// Share of line positions with a spot, over all frames, 0 to 1.
     pub rows_found: f64,
     /// Spots of the line found in the images.

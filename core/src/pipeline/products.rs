@@ -4,9 +4,10 @@ use std::path::Path;
 
 use super::progress::Progress;
 use super::quality::QualityCounter;
-use super::{Cargo, Event, ProductGroup, Request, Timings};
+use super::{Cargo, Colours, Event, ProductGroup, Request, Timings};
+use crate::depth_map::sheet::Sheet;
 use crate::depth_map::strips::{add_strip, strip_grid};
-use crate::depth_map::{FinishedMap, MapReader, SurfaceMap};
+use crate::depth_map::{FinishedMap, Grid, MapReader, SurfaceMap};
 use crate::error::{Error, Result};
 use crate::export::archive_mcap::ArchiveWriter;
 use crate::export::cloud_ply::CloudPlyWriter;
@@ -31,6 +32,8 @@ const SEGMENTS: &str = "recording";
 pub(super) struct Products<'a> {
     request: &'a Request,
     map: Option<SurfaceMap>,
+    /// What lays profiles on the map; with method `metric`.
+    sheet: Option<Sheet>,
     tiles: Option<TileWriter>,
     trajectory: Option<TrajectoryWriter>,
     cloud: Option<CloudPlyWriter>,
@@ -64,6 +67,7 @@ impl<'a> Products<'a> {
         Ok(Products {
             request,
             map: None,
+            sheet: None,
             tiles: None,
             trajectory: make(wanted(ProductGroup::Trajectory), || {
                 TrajectoryWriter::create(&folder.join("trajectory.csv"))
@@ -83,6 +87,13 @@ impl<'a> Products<'a> {
         self.recorder.as_ref().is_some_and(|recorder| recorder.wants_image(time_s))
     }
 
+    /// Whether any product shows the wall's colours.
+    pub(super) fn wants_colours(&self) -> bool {
+        // The depth maps alone, the trajectory and the stripes have none.
+        let coloured = |group: &ProductGroup| !matches!(group, ProductGroup::Depth | ProductGroup::Trajectory);
+        self.request.products.iter().any(coloured)
+    }
+
     /// Keeps a stripe, in the order of the frames.
     pub(super) fn stripe(&mut self, stripe: &Stripe) -> Result<()> {
         self.stripes.as_mut().map_or(Ok(()), |file| file.push_row(&stripe.across_px))
@@ -93,10 +104,7 @@ impl<'a> Products<'a> {
         let (measured, cargo) = (&placed.measured, &placed.measured.cargo);
         self.frames += 1;
         let points = surface_points(placed);
-        let line = self.request.rig.laser.line;
-        if let Some(map) = self.map_for(placed)? {
-            add_strip(map, line, placed, cargo.texture.as_ref())?;
-        }
+        self.add_to_map(placed, &points)?;
         if let Some(trajectory) = &mut self.trajectory {
             trajectory.push(&trajectory_row(placed))?;
         }
@@ -104,7 +112,9 @@ impl<'a> Products<'a> {
             points.iter().try_for_each(|point| cloud.push(point))?;
         }
         if let Some(archive) = &mut self.archive {
-            archive.pose(measured.time_s, &placed.world_from_camera)?;
+            if let Some(pose) = &placed.world_from_camera {
+                archive.pose(measured.time_s, pose)?;
+            }
             archive.profile(measured.time_s, &measured.profile, &points)?;
             archive.surface(measured.time_s, &points)?;
             archive.measurement(measured.frame, measured.time_s, &cargo.stripe, &measured.shift)?;
@@ -114,12 +124,12 @@ impl<'a> Products<'a> {
             let segments = recorder.log_frame(&FrameSteps {
                 frame_index: measured.frame,
                 time_s: measured.time_s,
-                image: picture.map(|p| &p.image),
-                effective_area: picture.map(|p| p.effective_area.as_slice()),
-                row_threshold: picture.map(|p| p.row_threshold.as_slice()),
+                image: picture.map(|p| &*p.image),
+                effective_area: picture.and_then(|p| p.effective_area.as_deref()),
+                row_threshold: picture.and_then(|p| p.row_threshold.as_deref()),
                 stripe: &cargo.stripe,
                 shift: &measured.shift,
-                world_from_camera: Some(placed.world_from_camera),
+                world_from_camera: placed.world_from_camera,
                 points: &points,
             })?;
             self.announce(segments, progress)?;
@@ -127,22 +137,61 @@ impl<'a> Products<'a> {
         self.write_changed_tiles()
     }
 
-    /// The map, which begins with the first frame that has points: their distance gives the pixel's size.
-    fn map_for(&mut self, placed: &Placed<Cargo>) -> Result<Option<&mut SurfaceMap>> {
-        let rig = &self.request.rig;
-        if let (None, Some(z_mm)) = (&self.map, placed.measured.profile.median_z_mm()) {
-            let line_x_mm = line_x_mm(rig, z_mm) + placed.world_from_camera.translation.x;
-            // Grid column 0 is where this frame's line lies.
-            let mut grid = strip_grid(rig, z_mm, line_x_mm);
-            grid.x_mm -= placed.travel_px.round() * grid.mm_per_px;
-            let folder = &self.request.out_dir;
-            self.map = Some(SurfaceMap::create(grid, self.request.recipe.map.tiles_in_memory as usize, folder)?);
-            if self.request.products.contains(&ProductGroup::Tiles) {
-                let grid = TileGrid { x0_mm: grid.x_mm, y0_mm: grid.y_mm, mm_per_px: grid.mm_per_px };
-                self.tiles = Some(TileWriter::create(folder, grid)?);
+    fn add_to_map(&mut self, placed: &Placed<Cargo>, points: &[SurfacePoint]) -> Result<()> {
+        self.begin_map(placed)?;
+        let Some(map) = &mut self.map else { return Ok(()) };
+        let colours = &placed.measured.cargo.colours;
+        match &mut self.sheet {
+            Some(sheet) => {
+                let positions: Vec<u32> =
+                    placed.measured.profile.points.iter().map(|point| point.line_position).collect();
+                let colours = match colours {
+                    Colours::Wall(wall) => Some(wall),
+                    _ => None,
+                };
+                sheet.add(map, points, &positions, placed.part, colours)
+            }
+            None => {
+                let strip = match colours {
+                    Colours::Strip(strip) => Some(strip),
+                    _ => None,
+                };
+                add_strip(map, self.request.rig.laser.line, placed, strip)
             }
         }
-        Ok(self.map.as_mut())
+    }
+
+    /// The map begins with the first placed frame that has points: their distance gives the pixel's size.
+    fn begin_map(&mut self, placed: &Placed<Cargo>) -> Result<()> {
+        let (rig, options) = (&self.request.rig, &self.request.recipe.map);
+        let (None, Some(z_mm), Some(pose)) =
+            (&self.map, placed.measured.profile.median_z_mm(), &placed.world_from_camera)
+        else {
+            return Ok(());
+        };
+        let grid = match &placed.strip {
+            Some(place) => {
+                // Grid column 0 is where this frame's line lies.
+                let mut grid = strip_grid(rig, z_mm, line_x_mm(rig, z_mm) + pose.translation.x);
+                grid.x_mm -= place.travel_px.round() * grid.mm_per_px;
+                grid
+            }
+            None => {
+                let mm_per_px = match options.mm_per_px {
+                    size if size > 0.0 => size,
+                    _ => round_up_125(z_mm / rig.camera.fx_px.min(rig.camera.fy_px)),
+                };
+                self.sheet = Some(Sheet::new(Grid { x_mm: 0.0, y_mm: 0.0, mm_per_px }, options.bridge_mm));
+                Grid { x_mm: 0.0, y_mm: 0.0, mm_per_px }
+            }
+        };
+        let folder = &self.request.out_dir;
+        self.map = Some(SurfaceMap::create(grid, options.tiles_in_memory as usize, folder)?);
+        if self.request.products.contains(&ProductGroup::Tiles) {
+            let grid = TileGrid { x0_mm: grid.x_mm, y0_mm: grid.y_mm, mm_per_px: grid.mm_per_px };
+            self.tiles = Some(TileWriter::create(folder, grid)?);
+        }
+        Ok(())
     }
 
     /// Hands tiles out while the run goes on, now and then, so that people can look.
@@ -326,12 +375,17 @@ fn line_x_mm(rig: &Rig, z_mm: f64) -> f64 {
     (plane.offset_mm - plane.normal.z * z_mm) / across
 }
 
+/// The next of 1, 2 and 5 times a power of ten.
+fn round_up_125(value: f64) -> f64 {
+    let power = 10f64.powf(value.log10().floor());
+    [1.0, 2.0, 5.0, 10.0].into_iter().map(|step| step * power).find(|size| *size >= value).unwrap_or(10.0 * power)
+}
+
 fn surface_points(placed: &Placed<Cargo>) -> Vec<SurfacePoint> {
-    let measured = &placed.measured;
-    let colour = |position: u32| measured.cargo.texture.as_ref().map_or([128; 3], |strip| strip.beside(position));
+    let (measured, Some(pose)) = (&placed.measured, &placed.world_from_camera) else { return Vec::new() };
     let points = measured.profile.points.iter().map(|point| SurfacePoint {
-        point_in_world: placed.world_from_camera * point.point_in_camera,
-        rgb: colour(point.line_position),
+        point_in_world: pose * point.point_in_camera,
+        rgb: measured.cargo.colours.at(point.line_position),
         confidence: point.confidence,
         frame: measured.frame,
     });
@@ -346,8 +400,8 @@ fn trajectory_row(placed: &Placed<Cargo>) -> TrajectoryRow {
         dx_px: shift.dx_px,
         dy_px: shift.dy_px,
         scale: shift.scale,
-        world_from_camera: Some(placed.world_from_camera),
-        rotation_determined: false,
+        world_from_camera: placed.world_from_camera,
+        rotation_determined: placed.degrees_of_freedom == 6,
         rows_found: measured.profile.points.len() as u32,
         tracked: shift.corners.len() as u32,
         residual_px: shift.residual_px,

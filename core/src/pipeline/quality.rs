@@ -3,7 +3,7 @@
 use crate::export::manifest::{Gap, Quality, Resolution};
 use crate::rig::Rig;
 use crate::stripe::Stripe;
-use crate::surface::Measured;
+use crate::surface::Placed;
 use crate::triangulation::{depth_step_mm, paper_constants, view_height_mm};
 
 /// Gaps that the manifest lists, at most; later ones are only counted.
@@ -33,15 +33,25 @@ impl QualityCounter {
         }
     }
 
-    /// Counts a frame with its stripe; `x_mm` is where it was placed.
-    pub(super) fn add<T>(&mut self, measured: &Measured<T>, stripe: &Stripe, x_mm: f64) {
+    /// Counts a frame with its stripe.
+    pub(super) fn add<T>(&mut self, placed: &Placed<T>, stripe: &Stripe) {
+        let measured = &placed.measured;
         let quality = &mut self.quality;
         quality.frames += 1;
         quality.spots += stripe.found() as u64;
         quality.points += measured.profile.points.len() as u64;
         quality.duration_s = measured.time_s;
-        quality.travel_mm += (x_mm - self.last_x_mm).abs();
-        self.last_x_mm = x_mm;
+        if let Some(pose) = placed.world_from_camera {
+            let x_mm = pose.translation.x;
+            quality.travel_mm += (x_mm - self.last_x_mm).abs();
+            self.last_x_mm = x_mm;
+        }
+        match placed.degrees_of_freedom {
+            6 => quality.frames_6_dof += 1,
+            3 => quality.frames_3_dof += 1,
+            _ => {}
+        }
+        quality.breaks = placed.part;
         self.line_positions += stripe.across_px.len() as u64;
         if stripe.found() > 0 {
             quality.frames_with_stripe += 1;
@@ -51,7 +61,8 @@ impl QualityCounter {
         if let Some(z_mm) = measured.profile.median_z_mm() {
             self.distance_mm.add(z_mm);
         }
-        if measured.shift.dx_px.is_some() {
+        let tracked = measured.shift.dx_px.is_some() && placed.world_from_camera.is_some();
+        if tracked {
             quality.frames_tracked += 1;
         } else if measured.frame > 0 {
             add_gap(&mut self.gaps, measured.frame, "not_tracked");

@@ -8,15 +8,14 @@ use crate::error::{Error, Result};
 use crate::recipe::Recipe;
 use crate::rig::Rig;
 use crate::source::{Frame, Source};
-use crate::stripe::{self, StripeSteps};
 
 /// Frames that wait between the two threads, at most.
 const FRAMES_WAIT: usize = 3;
 
-/// A frame with its stripe.
-pub(super) struct Seen {
+/// A frame with what was found in it alone.
+pub(super) struct Seen<T> {
     pub frame: Frame,
-    pub steps: StripeSteps,
+    pub found: T,
 }
 
 /// What the reading thread reports when it has ended.
@@ -31,18 +30,25 @@ pub(super) struct ReadingReport {
 }
 
 /// Starts the thread. It ends at the source's end, at an error, or when nobody listens any more.
-pub(super) fn start<'scope>(
+pub(super) fn start<'scope, T: Send + 'scope>(
     scope: &'scope Scope<'scope, '_>,
     source: Box<dyn Source>,
     rig: &'scope Rig,
     recipe: &'scope Recipe,
-) -> (Receiver<Result<Seen>>, ScopedJoinHandle<'scope, ReadingReport>) {
+    find: impl FnMut(&Frame) -> Result<T> + Send + 'scope,
+) -> (Receiver<Result<Seen<T>>>, ScopedJoinHandle<'scope, ReadingReport>) {
     let (sender, receiver) = sync_channel(FRAMES_WAIT);
-    let thread = scope.spawn(move || read(source, rig, recipe, &sender));
+    let thread = scope.spawn(move || read(source, rig, recipe, find, &sender));
     (receiver, thread)
 }
 
-fn read(mut source: Box<dyn Source>, rig: &Rig, recipe: &Recipe, out: &SyncSender<Result<Seen>>) -> ReadingReport {
+fn read<T>(
+    mut source: Box<dyn Source>,
+    rig: &Rig,
+    recipe: &Recipe,
+    mut find: impl FnMut(&Frame) -> Result<T>,
+    out: &SyncSender<Result<Seen<T>>>,
+) -> ReadingReport {
     let mut report = ReadingReport::default();
     let limit = recipe.limits.max_frames;
     for count in 0.. {
@@ -62,9 +68,7 @@ fn read(mut source: Box<dyn Source>, rig: &Rig, recipe: &Recipe, out: &SyncSende
         };
         report.decoding += start.elapsed();
         let start = Instant::now();
-        let seen = check_size(&frame, rig)
-            .and_then(|()| stripe::find(&frame.image, &rig.laser, &recipe.stripe))
-            .map(|steps| Seen { frame, steps });
+        let seen = check_size(&frame, rig).and_then(|()| find(&frame)).map(|found| Seen { frame, found });
         report.stripes += start.elapsed();
         let failed = seen.is_err();
         if out.send(seen).is_err() || failed {

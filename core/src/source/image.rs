@@ -1,21 +1,54 @@
-//! The pixels of a frame, in the colours that the camera's encoder meant.
+//! The pixels of a frame: as the decoder gave them, and in the colours that the camera's encoder meant.
 
-/// The pixels of a frame: 8 bits a channel, blue, green, red, row by row without padding.
-#[derive(Clone, Debug, PartialEq, Eq)]
+use std::sync::OnceLock;
+
+/// The pixels of a frame, 8 bits a channel: kept as the source gave them, converted once and only where asked for.
+///
+/// A decoder's luma and chroma stay in the decoder's own buffers, since converting a full HD frame to colours costs
+/// more than decoding it.
 pub struct Image {
     width_px: u32,
     height_px: u32,
-    bgr: Vec<u8>,
+    given: Given,
+    bgr: OnceLock<Vec<u8>>,
+    yuv: OnceLock<OwnPlanes>,
+}
+
+/// What the source gave.
+enum Given {
+    /// Colours: they are in `Image::bgr`.
+    Bgr,
+    /// A decoder's frame with three planes.
+    Yuv(YuvFormat, ffmpeg_the_third::frame::Video),
+}
+
+/// Luma and chroma that were made from colours.
+struct OwnPlanes {
+    format: YuvFormat,
+    y: Vec<u8>,
+    u: Vec<u8>,
+    v: Vec<u8>,
 }
 
 impl Image {
-    /// From `3 * width_px * height_px` bytes.
+    /// From `3 * width_px * height_px` bytes: blue, green, red, row by row without padding.
     ///
     /// # Panics
     /// With any other number of bytes.
     pub fn from_bgr(width_px: u32, height_px: u32, bgr: Vec<u8>) -> Image {
         assert_eq!(bgr.len(), 3 * width_px as usize * height_px as usize, "three bytes a pixel");
-        Image { width_px, height_px, bgr }
+        Image { width_px, height_px, given: Given::Bgr, bgr: OnceLock::from(bgr), yuv: OnceLock::new() }
+    }
+
+    /// From a decoder's frame of three planes of 8 bits.
+    pub(super) fn from_frame(format: YuvFormat, frame: ffmpeg_the_third::frame::Video) -> Image {
+        Image {
+            width_px: format.width_px as u32,
+            height_px: format.height_px as u32,
+            given: Given::Yuv(format, frame),
+            bgr: OnceLock::new(),
+            yuv: OnceLock::new(),
+        }
     }
 
     /// Columns.
@@ -28,15 +61,151 @@ impl Image {
         self.height_px
     }
 
-    /// The bytes: blue, green, red of each pixel.
+    /// Blue, green, red of each pixel, row by row without padding.
     pub fn bgr(&self) -> &[u8] {
-        &self.bgr
+        self.bgr.get_or_init(|| {
+            let planes = self.yuv();
+            bgr_from_yuv(&planes.format, planes.y, planes.u, planes.v)
+        })
     }
 
-    /// The bytes, given away.
-    pub fn into_bgr(self) -> Vec<u8> {
-        self.bgr
+    /// Luma and chroma as the decoder gave them; made from the colours where the source gave those.
+    pub fn yuv(&self) -> Yuv<'_> {
+        match &self.given {
+            Given::Yuv(format, frame) => {
+                let plane = |i| PlaneView { data: frame.data(i), stride_bytes: frame.stride(i) };
+                Yuv { format: *format, colours: Coefficients::of(format), y: plane(0), u: plane(1), v: plane(2) }
+            }
+            Given::Bgr => {
+                let own = self.yuv.get_or_init(|| own_planes(self.width_px as usize, self.height_px as usize, self.bgr()));
+                let width = own.format.width_px;
+                let plane = |data, stride_bytes| PlaneView { data, stride_bytes };
+                let chroma_width = width.div_ceil(2);
+                Yuv {
+                    format: own.format,
+                    colours: Coefficients::of(&own.format),
+                    y: plane(&own.y, width),
+                    u: plane(&own.u, chroma_width),
+                    v: plane(&own.v, chroma_width),
+                }
+            }
+        }
     }
+}
+
+impl PartialEq for Image {
+    /// The same size and colours, whatever the source gave them as.
+    fn eq(&self, other: &Image) -> bool {
+        (self.width_px, self.height_px) == (other.width_px, other.height_px) && self.bgr() == other.bgr()
+    }
+}
+
+impl std::fmt::Debug for Image {
+    fn fmt(&self, f: &mut std::fmt::Formatter<'_>) -> std::fmt::Result {
+        write!(f, "Image({}x{} px)", self.width_px, self.height_px)
+    }
+}
+
+/// Luma and chroma of an image, 8 bits a sample.
+#[derive(Clone, Copy)]
+pub struct Yuv<'a> {
+    format: YuvFormat,
+    colours: Coefficients,
+    y: PlaneView<'a>,
+    u: PlaneView<'a>,
+    v: PlaneView<'a>,
+}
+
+impl<'a> Yuv<'a> {
+    /// Columns of the luma.
+    pub fn width_px(&self) -> usize {
+        self.format.width_px
+    }
+
+    /// Rows of the luma.
+    pub fn height_px(&self) -> usize {
+        self.format.height_px
+    }
+
+    /// The luma: gamma-encoded brightness.
+    pub fn luma(&self) -> PlaneView<'a> {
+        self.y
+    }
+
+    /// Blue and red difference, 128 where there is no colour; `height >> shifts.1` rows of `width >> shifts.0` samples
+    /// (rounded up).
+    pub fn chroma(&self) -> (PlaneView<'a>, PlaneView<'a>) {
+        (self.u, self.v)
+    }
+
+    /// Luma samples per chroma sample along the columns and the rows, as shifts.
+    pub fn chroma_shifts(&self) -> (u32, u32) {
+        (self.format.chroma_shift_x, self.format.chroma_shift_y)
+    }
+
+    /// Light, 0 (black) to 1 (white), of each luma value: the camera's gamma undone (sRGB's curve). For a coloured
+    /// pixel that is no exact light, but it rises with it and does not depend on the chroma's place.
+    pub fn light(&self) -> &'static [f32; 256] {
+        static FULL: OnceLock<[f32; 256]> = OnceLock::new();
+        static LIMITED: OnceLock<[f32; 256]> = OnceLock::new();
+        let table = |black: f32, white: f32| {
+            std::array::from_fn(|i| {
+                let value = ((i as f32 - black) / (white - black)).max(0.0);
+                if value <= 0.04045 { value / 12.92 } else { ((value + 0.055) / 1.055).powf(2.4) }
+            })
+        };
+        if self.format.full_range {
+            FULL.get_or_init(|| table(0.0, 255.0))
+        } else {
+            LIMITED.get_or_init(|| table(16.0, 235.0))
+        }
+    }
+
+    /// Red, green, blue of a pixel, with the chroma of the nearest sample.
+    ///
+    /// # Panics
+    /// Outside the image.
+    pub fn rgb(&self, column: usize, row: usize) -> [u8; 3] {
+        let luma = self.y.data[row * self.y.stride_bytes + column];
+        let at = |plane: &PlaneView| {
+            plane.data[(row >> self.format.chroma_shift_y) * plane.stride_bytes + (column >> self.format.chroma_shift_x)]
+        };
+        let [blue, green, red] = self.colours.bgr(luma, at(&self.u), at(&self.v));
+        [red, green, blue]
+    }
+}
+
+/// Full-range BT.601 luma, and chroma of two by two pixels (as in a JPEG file), from colours.
+fn own_planes(width: usize, height: usize, bgr: &[u8]) -> OwnPlanes {
+    let format = YuvFormat {
+        width_px: width,
+        height_px: height,
+        chroma_shift_x: 1,
+        chroma_shift_y: 1,
+        chroma_left: false,
+        matrix: Matrix::Bt601,
+        full_range: true,
+    };
+    let y = bgr.chunks_exact(3).map(|p| {
+        ((7471 * u32::from(p[0]) + 38470 * u32::from(p[1]) + 19595 * u32::from(p[2]) + 32768) >> 16) as u8
+    });
+    let y: Vec<u8> = y.collect();
+    let (chroma_width, chroma_height) = (width.div_ceil(2), height.div_ceil(2));
+    let (mut u, mut v) = (Vec::with_capacity(chroma_width * chroma_height), Vec::new());
+    for row in 0..chroma_height {
+        for column in 0..chroma_width {
+            let mut sum = [0.0_f32; 3];
+            for (dx, dy) in [(0, 0), (1, 0), (0, 1), (1, 1)] {
+                let (x, y) = ((2 * column + dx).min(width - 1), (2 * row + dy).min(height - 1));
+                let at = 3 * (y * width + x);
+                (0..3).for_each(|i| sum[i] += f32::from(bgr[at + i]) / 4.0);
+            }
+            let luma = 0.114 * sum[0] + 0.587 * sum[1] + 0.299 * sum[2];
+            u.push((128.0 + (sum[0] - luma) / 1.772).round().clamp(0.0, 255.0) as u8);
+            v.push((128.0 + (sum[2] - luma) / 1.402).round().clamp(0.0, 255.0) as u8);
+        }
+    }
+    OwnPlanes { format, y, u, v }
 }
 
 /// Which weights of red and blue make the luma: ITU-R BT.601, BT.709 or BT.2020.
@@ -64,12 +233,15 @@ pub(super) struct YuvFormat {
 
 /// A plane of 8-bit samples.
 #[derive(Clone, Copy)]
-pub(super) struct PlaneView<'a> {
+pub struct PlaneView<'a> {
+    /// The samples, row by row.
     pub data: &'a [u8],
+    /// Bytes from one row to the next.
     pub stride_bytes: usize,
 }
 
 /// Fixed-point coefficients (16 fractional bits) of the conversion to R'G'B'.
+#[derive(Clone, Copy)]
 struct Coefficients {
     y_offset: i32,
     y: i32,
@@ -98,11 +270,22 @@ impl Coefficients {
             b_u: fixed(2.0 * (1.0 - kb) * chroma),
         }
     }
+
+    #[inline]
+    fn bgr(&self, y: u8, u: u8, v: u8) -> [u8; 3] {
+        let luma = (i32::from(y) - self.y_offset) * self.y + 32768;
+        let (u, v) = (i32::from(u) - 128, i32::from(v) - 128);
+        [
+            ((luma + self.b_u * u) >> 16).clamp(0, 255) as u8,
+            ((luma - self.g_u * u - self.g_v * v) >> 16).clamp(0, 255) as u8,
+            ((luma + self.r_v * v) >> 16).clamp(0, 255) as u8,
+        ]
+    }
 }
 
 /// Converts a planar frame. Chroma is interpolated along the rows at its true place, since half a
 /// pixel of colour shift would move the spot; between rows too where it is subsampled there.
-pub(super) fn image_from_yuv(format: &YuvFormat, y: PlaneView, u: PlaneView, v: PlaneView) -> Image {
+fn bgr_from_yuv(format: &YuvFormat, y: PlaneView, u: PlaneView, v: PlaneView) -> Vec<u8> {
     let (width, height) = (format.width_px, format.height_px);
     let c = Coefficients::of(format);
     let mut bgr = vec![0u8; 3 * width * height];
@@ -112,14 +295,10 @@ pub(super) fn image_from_yuv(format: &YuvFormat, y: PlaneView, u: PlaneView, v: 
         chroma_row(format, v, row, &mut v_row);
         let y_row = &y.data[row * y.stride_bytes..][..width];
         for (((bgr, y), u), v) in out.chunks_exact_mut(3).zip(y_row).zip(&u_row).zip(&v_row) {
-            let luma = (i32::from(*y) - c.y_offset) * c.y + 32768;
-            let (u, v) = (i32::from(*u) - 128, i32::from(*v) - 128);
-            bgr[0] = ((luma + c.b_u * u) >> 16).clamp(0, 255) as u8;
-            bgr[1] = ((luma - c.g_u * u - c.g_v * v) >> 16).clamp(0, 255) as u8;
-            bgr[2] = ((luma + c.r_v * v) >> 16).clamp(0, 255) as u8;
+            bgr.copy_from_slice(&c.bgr(*y, *u, *v));
         }
     }
-    Image::from_bgr(width as u32, height as u32, bgr)
+    bgr
 }
 
 /// One row of chroma at full width.
@@ -168,8 +347,8 @@ mod tests {
         let plane = |value: u8| vec![value; format.width_px * format.height_px];
         let (y, u, v) = (plane(y), plane(u), plane(v));
         let view = |p| PlaneView { data: p, stride_bytes: format.width_px };
-        let image = image_from_yuv(format, view(&y), view(&u), view(&v));
-        [image.bgr()[0], image.bgr()[1], image.bgr()[2]]
+        let bgr = bgr_from_yuv(format, view(&y), view(&u), view(&v));
+        [bgr[0], bgr[1], bgr[2]]
     }
 
     fn format(matrix: Matrix, full_range: bool) -> YuvFormat {

@@ -8,7 +8,7 @@ use ffmpeg::format::Pixel;
 use ffmpeg::software::scaling;
 use ffmpeg::util::{chroma, color};
 
-use super::image::{Image, Matrix, PlaneView, YuvFormat, image_from_yuv};
+use super::image::{Image, Matrix, YuvFormat};
 use super::{Frame, Source, SourceInfo};
 use crate::error::{Error, Result};
 use crate::rig::MAX_IMAGE_SIDE_PX;
@@ -138,14 +138,14 @@ impl Video {
 
     /// The next picture; `None` at the end of what can be read.
     pub(super) fn next_picture(&mut self) -> Result<Option<Picture>> {
-        let mut decoded = ffmpeg::frame::Video::empty();
         loop {
+            let mut decoded = ffmpeg::frame::Video::empty();
             match self.decoder.receive_frame(&mut decoded) {
                 Ok(()) => {
                     self.bad_in_a_row = 0;
                     check_size(&self.name, decoded.width(), decoded.height())?;
                     let time_s = decoded.timestamp().or(decoded.pts()).map(|t| t as f64 * self.time_base_s);
-                    return Ok(Some(Picture { time_s, image: image(&decoded)? }));
+                    return Ok(Some(Picture { time_s, image: image(decoded)? }));
                 }
                 Err(ffmpeg::Error::Eof) => return Ok(None),
                 // The decoder wants more; anything else is a broken picture that is counted where it was sent.
@@ -196,7 +196,7 @@ impl Video {
 }
 
 /// The colours of a decoded frame.
-fn image(frame: &ffmpeg::frame::Video) -> Result<Image> {
+fn image(frame: ffmpeg::frame::Video) -> Result<Image> {
     let (width, height) = (frame.width() as usize, frame.height() as usize);
     if let Some((chroma_shift_x, chroma_shift_y)) = planar_shifts(frame.format()) {
         let format = YuvFormat {
@@ -204,19 +204,18 @@ fn image(frame: &ffmpeg::frame::Video) -> Result<Image> {
             height_px: height,
             chroma_shift_x,
             chroma_shift_y,
-            chroma_left: chroma_left(frame),
-            matrix: matrix(frame),
-            full_range: full_range(frame),
+            chroma_left: chroma_left(&frame),
+            matrix: matrix(&frame),
+            full_range: full_range(&frame),
         };
-        let plane = |i| PlaneView { data: frame.data(i), stride_bytes: frame.stride(i) };
-        return Ok(image_from_yuv(&format, plane(0), plane(1), plane(2)));
+        return Ok(Image::from_frame(format, frame));
     }
     let target = if is_rgb(frame.format()) { Pixel::BGR24 } else { Pixel::YUV444P };
-    let mut converted = convert(frame, target)?;
+    let mut converted = convert(&frame, target)?;
     if target == Pixel::YUV444P {
         converted.set_color_space(frame.color_space());
         converted.set_color_range(frame.color_range());
-        return image(&converted);
+        return image(converted);
     }
     let stride = converted.stride(0);
     let bgr = (0..height).flat_map(|r| &converted.data(0)[r * stride..][..3 * width]).copied().collect();

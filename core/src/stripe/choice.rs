@@ -3,6 +3,8 @@
 //! The paper knows one spot per row. Real images hold more: other lamps, paint, a second line. The
 //! sequence of spots that is strong and bends least is found by dynamic programming over the rows.
 
+use serde::{Deserialize, Serialize};
+
 /// A spot that a row may have.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub(super) struct Candidate {
@@ -28,6 +30,39 @@ const OPEN_ENDS: usize = 16;
 const PIECE_SLOPE_PX: f32 = 1.5;
 /// Rows without a spot that do not end a piece.
 const PIECE_GAP_ROWS: usize = 3;
+
+/// Which of several spots in a row is the line.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Serialize, Deserialize)]
+#[serde(rename_all = "lowercase")]
+pub enum SpotChoice {
+    /// The one that continues the line of the other rows, strong and little bent.
+    #[default]
+    Continuous,
+    /// The strongest of its row.
+    Strongest,
+    /// The one at the least column (row, with a horizontal line).
+    First,
+    /// The one at the greatest.
+    Last,
+}
+
+/// One spot or none per row by the given rule; no piece of the line is shorter than `piece_min_rows`.
+pub(super) fn choose(rows: &[Vec<Candidate>], choice: SpotChoice, piece_min_rows: usize) -> Vec<Option<Candidate>> {
+    let mut line = match choice {
+        SpotChoice::Continuous => strongest_path(rows),
+        SpotChoice::Strongest => {
+            rows.iter().map(|row| row.iter().max_by(|a, b| a.contrast.total_cmp(&b.contrast)).copied()).collect()
+        }
+        SpotChoice::First => {
+            rows.iter().map(|row| row.iter().min_by(|a, b| a.across_px.total_cmp(&b.across_px)).copied()).collect()
+        }
+        SpotChoice::Last => {
+            rows.iter().map(|row| row.iter().max_by(|a, b| a.across_px.total_cmp(&b.across_px)).copied()).collect()
+        }
+    };
+    drop_short_pieces(&mut line, piece_min_rows);
+    line
+}
 
 /// One spot or none per row, in the order of the rows; no piece of the line is shorter than `piece_min_rows`.
 pub(super) fn continuous(rows: &[Vec<Candidate>], piece_min_rows: usize) -> Vec<Option<Candidate>> {

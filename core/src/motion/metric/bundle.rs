@@ -1,0 +1,286 @@
+//! The poses of the last key frames and the places of all landmarks, adjusted together (bundle adjustment).
+//!
+//! Least squares over every sight of every landmark and every depth that the laser gave, robust against wrong ones. The
+//! landmarks are taken out of the equations first (Schur's complement), so that what is solved has six unknowns per
+//! free key frame.
+
+use nalgebra::{DMatrix, DVector, Isometry3, Matrix3, Matrix6, Point3, SMatrix, Vector3, Vector6};
+
+use super::pose::{HUBER, moved, projection};
+
+/// Added to the diagonal, as a share of it (Levenberg and Marquardt): at first, least and most, and how it changes.
+const DAMPING: f64 = 1e-4;
+const DAMPING_RANGE: (f64, f64) = (1e-7, 1e3);
+const DAMPING_STEP: f64 = 10.0;
+
+/// A key frame's pose.
+#[derive(Clone, Copy, Debug)]
+pub(super) struct View {
+    pub camera_from_world: Isometry3<f64>,
+    /// Whether the pose may still change.
+    pub free: bool,
+}
+
+/// A landmark as the adjustment sees it.
+pub(super) struct Place {
+    pub world: Point3<f64>,
+    pub sights: Vec<PlaceSight>,
+    pub depths: Vec<PlaceDepth>,
+    /// Covariance of the place, mm², as if the poses were certain; set by the adjustment.
+    pub covariance: Matrix3<f64>,
+}
+
+/// A landmark seen in a key frame.
+#[derive(Clone, Copy, Debug)]
+pub(super) struct PlaceSight {
+    pub view: usize,
+    /// Undistorted (X / Z, Y / Z).
+    pub ray: [f64; 2],
+    pub sigma: f64,
+}
+
+/// What is known of a landmark's depth: `direction · point = distance_mm` in a key frame's camera.
+#[derive(Clone, Copy, Debug)]
+pub(super) struct PlaceDepth {
+    pub view: usize,
+    pub direction: Vector3<f64>,
+    pub distance_mm: f64,
+    pub sigma_mm: f64,
+}
+
+type Block = SMatrix<f64, 6, 3>;
+
+/// Adjusts in at most `rounds` rounds; a round that would fit worse changes nothing.
+pub(super) fn adjust(views: &mut [View], places: &mut [Place], rounds: usize) {
+    let mut damping = DAMPING;
+    let mut cost = total_cost(views, places);
+    for _ in 0..rounds {
+        let before: (Vec<View>, Vec<Point3<f64>>) = (views.to_vec(), places.iter().map(|p| p.world).collect());
+        let solved = round(views, places, damping);
+        let new_cost = if solved { total_cost(views, places) } else { f64::MAX };
+        if new_cost <= cost {
+            cost = new_cost;
+            damping = (damping / DAMPING_STEP).max(DAMPING_RANGE.0);
+            continue;
+        }
+        views.copy_from_slice(&before.0);
+        places.iter_mut().zip(before.1).for_each(|(place, world)| place.world = world);
+        damping = (damping * DAMPING_STEP * DAMPING_STEP).min(DAMPING_RANGE.1);
+    }
+}
+
+/// What all sights and depths are off by: squares for small errors, straight for large ones (Huber).
+pub(super) fn total_cost(views: &[View], places: &[Place]) -> f64 {
+    let huber = |size: f64| if size > HUBER { HUBER * (2.0 * size - HUBER) } else { size * size };
+    let of_place = |place: &Place| {
+        let sights = place.sights.iter().map(|sight| {
+            let p = views[sight.view].camera_from_world * place.world;
+            // Behind the camera nothing is seen: as wrong as can be.
+            let Some((seen, ..)) = projection(&p) else { return huber(1e6) };
+            huber((sight.ray[0] - seen.x).hypot(sight.ray[1] - seen.y) / sight.sigma)
+        });
+        let depths = place.depths.iter().map(|depth| {
+            let p = views[depth.view].camera_from_world * place.world;
+            huber((depth.distance_mm - depth.direction.dot(&p.coords)).abs() / depth.sigma_mm)
+        });
+        sights.chain(depths).sum::<f64>()
+    };
+    places.iter().map(of_place).sum()
+}
+
+/// One round. False where the equations could not be solved; nothing has changed then.
+fn round(views: &mut [View], places: &mut [Place], damping: f64) -> bool {
+    let free: Vec<Option<usize>> = {
+        let mut next = 0;
+        views
+            .iter()
+            .map(|view| {
+                view.free.then(|| {
+                    next += 1;
+                    next - 1
+                })
+            })
+            .collect()
+    };
+    let count = free.iter().flatten().count();
+    let mut normal = DMatrix::<f64>::zeros(6 * count, 6 * count);
+    let mut right = DVector::<f64>::zeros(6 * count);
+    let mut eliminated: Vec<Eliminated> = Vec::with_capacity(places.len());
+    for place in places.iter() {
+        let equations = Equations::of(place, views, &free);
+        eliminated.push(equations.eliminate(&mut normal, &mut right, damping));
+    }
+    for i in 0..6 * count {
+        normal[(i, i)] *= 1.0 + damping;
+        normal[(i, i)] += 1e-9;
+    }
+    let delta = if count == 0 {
+        right
+    } else {
+        let Some(solved) = normal.cholesky().map(|c| c.solve(&right)) else { return false };
+        solved
+    };
+    if !delta.iter().all(|v| v.is_finite()) {
+        return false;
+    }
+    for (place, part) in places.iter_mut().zip(&eliminated) {
+        let Some(inverse) = part.inverse else { continue };
+        let mut right = part.right;
+        for (view, block) in &part.blocks {
+            right -= block.transpose() * delta.fixed_rows::<6>(6 * view);
+        }
+        place.world += inverse * right;
+        place.covariance = inverse;
+    }
+    for (view, index) in views.iter_mut().zip(&free) {
+        if let Some(index) = index {
+            let step: Vector6<f64> = delta.fixed_rows::<6>(6 * index).into();
+            view.camera_from_world = moved(&view.camera_from_world, &step);
+        }
+    }
+    true
+}
+
+/// One landmark's part of the normal equations.
+struct Equations {
+    own: Matrix3<f64>,
+    right: Vector3<f64>,
+    /// Per free view: its own block, its right side, and the block that couples it with the landmark.
+    views: Vec<(usize, Matrix6<f64>, Vector6<f64>, Block)>,
+}
+
+struct Eliminated {
+    inverse: Option<Matrix3<f64>>,
+    right: Vector3<f64>,
+    blocks: Vec<(usize, Block)>,
+}
+
+impl Equations {
+    fn of(place: &Place, views: &[View], free: &[Option<usize>]) -> Equations {
+        let mut equations = Equations { own: Matrix3::zeros(), right: Vector3::zeros(), views: Vec::new() };
+        for sight in &place.sights {
+            let pose = &views[sight.view].camera_from_world;
+            let p = pose * place.world;
+            let Some((seen, by_move, by_point)) = projection(&p) else { continue };
+            let miss = [sight.ray[0] - seen.x, sight.ray[1] - seen.y];
+            let size = miss[0].hypot(miss[1]) / sight.sigma;
+            let weight = robust(size) / (sight.sigma * sight.sigma);
+            let rotation = pose.rotation.to_rotation_matrix();
+            for (axis, miss) in miss.into_iter().enumerate() {
+                let row = Vector3::from(by_point[axis]);
+                let by_place = rotation.transpose() * row;
+                equations.add(free[sight.view], &Vector6::from(by_move[axis]), &by_place, weight, miss);
+            }
+        }
+        for depth in &place.depths {
+            let pose = &views[depth.view].camera_from_world;
+            let p = pose * place.world;
+            let miss = depth.distance_mm - depth.direction.dot(&p.coords);
+            let weight = robust(miss.abs() / depth.sigma_mm) / (depth.sigma_mm * depth.sigma_mm);
+            let turn = p.coords.cross(&depth.direction);
+            let d = depth.direction;
+            let by_move = Vector6::new(turn.x, turn.y, turn.z, d.x, d.y, d.z);
+            let by_place = pose.rotation.inverse() * d;
+            equations.add(free[depth.view], &by_move, &by_place, weight, miss);
+        }
+        equations
+    }
+
+    fn add(
+        &mut self,
+        view: Option<usize>,
+        by_move: &Vector6<f64>,
+        by_place: &Vector3<f64>,
+        weight: f64,
+        miss: f64,
+    ) {
+        self.own += weight * by_place * by_place.transpose();
+        self.right += weight * miss * by_place;
+        let Some(view) = view else { return };
+        let at = self.views.iter().position(|v| v.0 == view).unwrap_or_else(|| {
+            self.views.push((view, Matrix6::zeros(), Vector6::zeros(), Block::zeros()));
+            self.views.len() - 1
+        });
+        let (_, own, right, block) = &mut self.views[at];
+        *own += weight * by_move * by_move.transpose();
+        *right += weight * miss * by_move;
+        *block += weight * by_move * by_place.transpose();
+    }
+
+    /// Adds what is left of the equations when the landmark is taken out.
+    fn eliminate(self, normal: &mut DMatrix<f64>, right: &mut DVector<f64>, damping: f64) -> Eliminated {
+        let mut own = self.own;
+        (0..3).for_each(|i| own[(i, i)] *= 1.0 + damping);
+        let inverse = own.try_inverse().filter(|m| m.iter().all(|v| v.is_finite()));
+        let blocks: Vec<(usize, Block)> = self.views.iter().map(|v| (v.0, v.3)).collect();
+        let Some(inverse) = inverse else {
+            return Eliminated { inverse: None, right: self.right, blocks };
+        };
+        for (view, own, own_right, block) in &self.views {
+            let scaled = block * inverse;
+            let mut part = right.fixed_rows_mut::<6>(6 * view);
+            part += own_right - scaled * self.right;
+            let mut diagonal = normal.fixed_view_mut::<6, 6>(6 * view, 6 * view);
+            diagonal += own;
+            for (other, other_block) in &blocks {
+                let mut cross = normal.fixed_view_mut::<6, 6>(6 * view, 6 * other);
+                cross -= scaled * other_block.transpose();
+            }
+        }
+        Eliminated { inverse: Some(inverse), right: self.right, blocks }
+    }
+}
+
+/// Huber's weight.
+fn robust(size: f64) -> f64 {
+    if size > HUBER { HUBER / size } else { 1.0 }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn a_bent_way_is_straightened_by_depths_and_sights() {
+        let truth = |i: usize| Isometry3::translation(-40.0 * i as f64, 0.3 * i as f64, 0.0);
+        let world: Vec<Point3<f64>> = (0..60)
+            .map(|i| Point3::new(-150.0 + 9.0 * i as f64, (i * 37 % 200) as f64 - 100.0, 450.0 + (i % 7) as f64))
+            .collect();
+        let mut views: Vec<View> = (0..5)
+            .map(|i| {
+                let error = Vector6::new(0.002, -0.001, 0.001, 1.5, -1.0, 2.0) * if i == 0 { 0.0 } else { 1.0 };
+                View { camera_from_world: moved(&truth(i), &error), free: i > 0 }
+            })
+            .collect();
+        let mut places: Vec<Place> = world
+            .iter()
+            .enumerate()
+            .map(|(n, p)| {
+                let sights = (0..5).map(|view| {
+                    let c = truth(view) * p;
+                    PlaceSight { view, ray: [c.x / c.z, c.y / c.z], sigma: 1e-4 }
+                });
+                let depth = PlaceDepth {
+                    view: 2,
+                    direction: Vector3::z(),
+                    distance_mm: (truth(2) * p).z,
+                    sigma_mm: if n % 3 == 0 { 0.1 } else { 30.0 },
+                };
+                Place {
+                    world: p + Vector3::new(1.0, -2.0, 12.0),
+                    sights: sights.collect(),
+                    depths: vec![depth],
+                    covariance: Matrix3::zeros(),
+                }
+            })
+            .collect();
+        adjust(&mut views, &mut places, 12);
+        for (i, view) in views.iter().enumerate() {
+            let off = (view.camera_from_world.translation.vector - truth(i).translation.vector).norm();
+            assert!(off < 1e-3, "view {i}: {off} mm");
+        }
+        for (place, truth) in places.iter().zip(&world) {
+            assert!((place.world - truth).norm() < 1e-3);
+        }
+    }
+}

@@ -1,0 +1,845 @@
+//! Frame by frame: predict, find the landmarks, solve the pose; at key frames choose landmarks and adjust.
+
+use std::collections::{BTreeMap, HashMap, VecDeque};
+
+use nalgebra::{Isometry3, Matrix3, Point3, UnitQuaternion, Vector3};
+
+use super::bundle::{self, Place, PlaceDepth, PlaceSight, View};
+use super::depth::{self, Known};
+use super::image::{Gray, Small};
+use super::landmark::{Landmark, best_place};
+use super::patch::Found;
+use super::pose::{self, Sight};
+use crate::geometry::{RawPixel, WorldFromCamera};
+use crate::motion::similarity::{FEWEST_CORNERS, median, scale_and_residual};
+use crate::motion::{Shift, TrackedCorner};
+use crate::recipe::PoseOptions;
+use crate::rig::{LineDirection, Rig};
+use crate::source::Yuv;
+use crate::stripe::Stripe;
+use crate::triangulation::Profile;
+
+/// Fewest landmarks that a pose is solved from.
+const FEWEST_SIGHTS: usize = 10;
+/// Fewest points of a profile that a run can begin with.
+const FEWEST_POINTS: usize = 30;
+/// How far from the predicted place a patch is looked for, px of the full image.
+const NEAR_PX: f32 = 5.0;
+/// The same in the shrunk image, px of that.
+const NEAR_SMALL_PX: f32 = 14.0;
+/// Landmarks that are tried first: when most are where they should be, the prediction is good.
+const PROBES: usize = 14;
+/// Share of the probes that must be found.
+const PROBES_FOUND: f64 = 0.6;
+/// Least likeness of a patch that is believed; in the shrunk image.
+const LEAST_LIKENESS: f32 = 0.6;
+const LEAST_LIKENESS_SMALL: f32 = 0.7;
+/// Standard deviation of a place found in the shrunk image, px of the full one.
+const COARSE_SIGMA_PX: f64 = 1.5;
+/// Share of the landmarks in view that must be found in the full image; else the shrunk one helps, which is less noisy.
+const FOUND_SHARE: f64 = 0.5;
+/// Key frames at the start of a part that are this much closer together: nothing is known of most depths yet.
+const EARLY_KEYFRAMES: usize = 4;
+const EARLY_STEP: f64 = 0.2;
+/// Least and greatest standard deviation of a found place, px.
+const SIGMA_PX: (f64, f64) = (0.04, 1.0);
+/// Sights further off than this many standard deviations are wrong.
+const OUTLIER: f64 = 5.0;
+/// Frames in a row without a landmark that should be there, after which it is given up.
+const MISSES: u32 = 6;
+/// Landmarks out of view that are kept for a robot that comes back.
+const DORMANT: usize = 300;
+/// Standard deviation of the laser's depth at one line position, px of the stripe.
+const STRIPE_SIGMA_PX: f64 = 0.12;
+/// Line positions on each side whose median gives a landmark's depth.
+const DEPTH_REACH: i64 = 2;
+/// A depth known better than this share is one that neighbours may rely on.
+const SURE_SHARE: f64 = 0.01;
+/// Rounds of the adjustment at a key frame; more at the start, when little is known.
+const ROUNDS: usize = 2;
+const ROUNDS_AT_START: usize = 6;
+/// Rotation that a pose is kept from where the landmarks do not tell it, radians and mm of one standard deviation.
+const HOLD_RAD: f64 = 0.05;
+const HOLD_MM: f64 = 50.0;
+/// Where the landmarks tell a rotation worse than this, radians, it is held as predicted: three degrees of freedom.
+const ROTATION_SIGMA_RAD: f64 = 0.004;
+const HOLD_FIRM_RAD: f64 = 1e-4;
+
+/// What a frame's motion is at once; its pose may still be adjusted.
+#[derive(Clone, Debug)]
+pub struct Motion {
+    /// The pose as far as it is known now; `None` where the frame could not be placed.
+    pub camera_from_world: Option<Isometry3<f64>>,
+    /// The image's motion since the frame before.
+    pub shift: Shift,
+}
+
+/// A frame's pose, final.
+#[derive(Clone, Debug, PartialEq)]
+pub struct SettledPose {
+    /// The frame's index.
+    pub frame: u32,
+    /// Where the camera was; `None` where the motion was lost or not yet known.
+    pub world_from_camera: Option<WorldFromCamera>,
+    /// Part of the way without a break that the frame belongs to, from 0; a surface is not joined across parts.
+    pub part: u32,
+    /// 6, or 3 where the scene did not tell the rotation.
+    pub degrees_of_freedom: u8,
+}
+
+/// Finds the poses of a run.
+pub struct Odometry {
+    rig: Rig,
+    options: PoseOptions,
+    landmarks: BTreeMap<u32, Landmark>,
+    next_landmark: u32,
+    keyframes: VecDeque<Keyframe>,
+    next_keyframe: u32,
+    waiting: VecDeque<Waiting>,
+    settled: Vec<SettledPose>,
+    last: Option<Last>,
+    lost: u32,
+    part: u32,
+}
+
+/// The frame before.
+struct Last {
+    pose: Isometry3<f64>,
+    /// Move of the camera's frame from the frame before that.
+    velocity: Isometry3<f64>,
+    places: HashMap<u32, (f32, f32)>,
+    profile: Vec<Option<Point3<f64>>>,
+    since_keyframe_px: f64,
+    tracked_at_keyframe: usize,
+}
+
+struct Keyframe {
+    number: u32,
+    camera_from_world: Isometry3<f64>,
+    fixed: bool,
+}
+
+/// A frame whose pose is not settled.
+struct Waiting {
+    frame: u32,
+    pose: Option<Isometry3<f64>>,
+    sights: Vec<Sight>,
+    /// The first key frame at or after it.
+    keyframe: u32,
+    part: u32,
+    degrees_of_freedom: u8,
+}
+
+/// What the frame shows, for all steps.
+struct View3<'a> {
+    gray: Gray<'a>,
+    small: std::cell::OnceCell<Small>,
+    line: LineBand,
+    frame: u32,
+}
+
+impl View3<'_> {
+    fn small(&self) -> Gray<'_> {
+        self.small.get_or_init(|| Small::of(self.gray)).gray()
+    }
+}
+
+/// Where the laser line is: nothing near it is the wall's own look.
+struct LineBand {
+    direction: LineDirection,
+    /// At each line position the line's place or its neighbours', px; empty where there is no line at all.
+    across_px: Vec<f32>,
+    half_px: f32,
+}
+
+impl LineBand {
+    fn of(stripe: &Stripe, line_width_px: f32) -> LineBand {
+        let mut across_px = stripe.across_px.clone();
+        let mut last = across_px.iter().copied().find(|x| x.is_finite());
+        match last {
+            None => across_px.clear(),
+            Some(_) => {
+                for x in &mut across_px {
+                    if x.is_finite() {
+                        last = Some(*x);
+                    } else if let Some(last) = last {
+                        *x = last;
+                    }
+                }
+            }
+        }
+        LineBand { direction: stripe.line, across_px, half_px: 2.0 * line_width_px + 14.0 }
+    }
+
+    /// (along, across) of an image place.
+    fn axes(&self, place: (f64, f64)) -> (f64, f64) {
+        match self.direction {
+            LineDirection::Vertical => (place.1, place.0),
+            LineDirection::Horizontal => (place.0, place.1),
+        }
+    }
+
+    /// Signed distance across the line, px.
+    fn distance_px(&self, place: (f64, f64)) -> Option<f64> {
+        let (along, across) = self.axes(place);
+        let last = self.across_px.len().checked_sub(1)?;
+        let at = along.round().clamp(0.0, last as f64) as usize;
+        Some(across - f64::from(self.across_px[at]))
+    }
+
+    fn covers(&self, place: (f64, f64)) -> bool {
+        let (along, across) = self.axes(place);
+        let Some(last) = self.across_px.len().checked_sub(1) else { return false };
+        // Over the patch's own height the line may lean.
+        [-9.0, 0.0, 9.0].iter().any(|off| {
+            let at = (along + off).round().clamp(0.0, last as f64) as usize;
+            (across - f64::from(self.across_px[at])).abs() < f64::from(self.half_px)
+        })
+    }
+}
+
+impl Odometry {
+    /// An odometry at the start of a run.
+    pub fn new(rig: &Rig, options: &PoseOptions) -> Odometry {
+        Odometry {
+            rig: rig.clone(),
+            options: options.clone(),
+            landmarks: BTreeMap::new(),
+            next_landmark: 0,
+            keyframes: VecDeque::new(),
+            next_keyframe: 0,
+            waiting: VecDeque::new(),
+            settled: Vec::new(),
+            last: None,
+            lost: 0,
+            part: 0,
+        }
+    }
+
+    /// Takes the next frame with its stripe (`line_width_px` wide at half its height) and profile.
+    pub fn track(
+        &mut self,
+        frame: u32,
+        image: Yuv<'_>,
+        stripe: &Stripe,
+        profile: &Profile,
+        line_width_px: f32,
+    ) -> Motion {
+        let view = View3 {
+            gray: Gray::of(image),
+            small: std::cell::OnceCell::new(),
+            line: LineBand::of(stripe, line_width_px),
+            frame,
+        };
+        let rows = dense(profile, stripe.across_px.len());
+        let Some(last) = self.last.take() else {
+            return self.begin(&view, profile, rows, self.start_pose());
+        };
+        match self.follow(&view, &last) {
+            Some(followed) => {
+                self.lost = 0;
+                self.advance(&view, profile, rows, last, followed)
+            }
+            None => self.miss(&view, profile, rows, last),
+        }
+    }
+
+    /// The poses that are final since this was last asked, in the order of the frames.
+    pub fn take_settled(&mut self) -> Vec<SettledPose> {
+        std::mem::take(&mut self.settled)
+    }
+
+    /// The run has ended: all poses are final.
+    pub fn finish(&mut self) {
+        self.adjust(ROUNDS);
+        while let Some(waiting) = self.waiting.pop_front() {
+            self.settle(waiting);
+        }
+    }
+
+    /// The world's start (lib.rs): the camera's frame, turned so that x lies along the travel.
+    fn start_pose(&self) -> Isometry3<f64> {
+        match self.rig.laser.line {
+            LineDirection::Vertical => Isometry3::identity(),
+            LineDirection::Horizontal => Isometry3::from_parts(
+                Vector3::zeros().into(),
+                UnitQuaternion::from_axis_angle(&Vector3::z_axis(), std::f64::consts::FRAC_PI_2),
+            ),
+        }
+    }
+
+    /// The first frame of a part: nothing to follow yet.
+    fn begin(
+        &mut self,
+        view: &View3<'_>,
+        profile: &Profile,
+        rows: Vec<Option<Point3<f64>>>,
+        pose: Isometry3<f64>,
+    ) -> Motion {
+        if profile.points.len() < FEWEST_POINTS {
+            // Without a depth there is no measure: the run begins with the first line.
+            self.wait(view.frame, None, Vec::new(), 6);
+            return Motion { camera_from_world: None, shift: Shift::default() };
+        }
+        self.wait(view.frame, Some(pose), Vec::new(), 6);
+        self.keyframes.push_back(Keyframe { number: self.next_keyframe, camera_from_world: pose, fixed: true });
+        self.next_keyframe += 1;
+        self.choose_landmarks(view, profile, &pose);
+        let places = self.alive_places(&pose);
+        self.last = Some(Last {
+            pose,
+            velocity: Isometry3::identity(),
+            tracked_at_keyframe: places.len(),
+            places,
+            profile: rows,
+            since_keyframe_px: 0.0,
+        });
+        Motion { camera_from_world: Some(pose), shift: Shift::default() }
+    }
+
+    /// Lost: wait for the wall to come back; after a while take the way to be broken and begin anew where it was lost.
+    fn miss(
+        &mut self,
+        view: &View3<'_>,
+        profile: &Profile,
+        rows: Vec<Option<Point3<f64>>>,
+        mut last: Last,
+    ) -> Motion {
+        self.lost += 1;
+        if self.lost > self.options.lost_max && profile.points.len() >= FEWEST_POINTS {
+            self.lost = 0;
+            self.part += 1;
+            let pose = last.pose;
+            self.adjust(ROUNDS);
+            self.settle_all();
+            self.landmarks.clear();
+            self.keyframes.clear();
+            return self.begin(view, profile, rows, pose);
+        }
+        self.wait(view.frame, None, Vec::new(), 6);
+        last.velocity = Isometry3::identity();
+        last.places.clear();
+        last.profile.clear();
+        self.landmarks.values_mut().for_each(|landmark| landmark.from_line_px = None);
+        self.last = Some(last);
+        Motion { camera_from_world: None, shift: Shift::default() }
+    }
+
+    fn advance(
+        &mut self,
+        view: &View3<'_>,
+        profile: &Profile,
+        rows: Vec<Option<Point3<f64>>>,
+        last: Last,
+        followed: Followed,
+    ) -> Motion {
+        let pose = followed.pose;
+        let shift = shift_between(&last.places, &followed.places);
+        self.cross_line(view, &pose, &rows, &last);
+        let moved_px = shift.dx_px.unwrap_or(0.0).hypot(shift.dy_px.unwrap_or(0.0));
+        let tracked = followed.sights.len();
+        let mut last = Last {
+            pose,
+            velocity: pose * last.pose.inverse(),
+            places: followed.places,
+            profile: rows,
+            since_keyframe_px: last.since_keyframe_px + moved_px,
+            tracked_at_keyframe: last.tracked_at_keyframe,
+        };
+        let early = self.keyframes.len() < EARLY_KEYFRAMES;
+        let share = self.options.keyframe_share * if early { EARLY_STEP } else { 1.0 };
+        let step_px = share * f64::from(self.rig.camera.width_px);
+        let is_keyframe = last.since_keyframe_px >= step_px || (tracked as f64) < 0.6 * last.tracked_at_keyframe as f64;
+        self.wait(view.frame, Some(pose), followed.sights.clone(), followed.degrees_of_freedom);
+        if is_keyframe {
+            self.add_keyframe(pose, &followed.sights);
+            let first = self.next_keyframe <= 2 * self.options.window;
+            self.adjust(if first { ROUNDS_AT_START } else { ROUNDS });
+            let adjusted = self.keyframes.back().map_or(pose, |k| k.camera_from_world);
+            last.pose = adjusted;
+            self.choose_landmarks(view, profile, &adjusted);
+            self.settle_finished();
+            last.since_keyframe_px = 0.0;
+            last.tracked_at_keyframe = tracked.max(FEWEST_SIGHTS);
+            self.prune(view.frame);
+        }
+        while self.waiting.len() > self.options.waiting_max as usize {
+            if let Some(waiting) = self.waiting.pop_front() {
+                self.settle(waiting);
+            }
+        }
+        let camera_from_world = Some(last.pose);
+        self.last = Some(last);
+        Motion { camera_from_world, shift }
+    }
+}
+
+/// A frame whose landmarks were found.
+struct Followed {
+    pose: Isometry3<f64>,
+    sights: Vec<Sight>,
+    places: HashMap<u32, (f32, f32)>,
+    degrees_of_freedom: u8,
+}
+
+impl Odometry {
+    /// Finds the landmarks near where the last motion puts them; where that fails, in the shrunk image first.
+    fn follow(&mut self, view: &View3<'_>, last: &Last) -> Option<Followed> {
+        let predicted = last.velocity * last.pose;
+        if self.probe(view, &predicted)
+            && let Some(followed) = self.solve_frame(view, &predicted, &HashMap::new())
+        {
+            return Some(followed);
+        }
+        [predicted, last.pose].iter().find_map(|start| {
+            let (coarse, places) = self.coarse_pose(view, start)?;
+            self.solve_frame(view, &coarse, &places)
+        })
+    }
+
+    /// Landmarks in view and off the line, with where they should be.
+    fn visible(&self, view: &View3<'_>, pose: &Isometry3<f64>) -> Vec<(u32, (f64, f64))> {
+        let inside = |at: &(f64, f64)| view.gray.holds(at.0 as f32, at.1 as f32, 10.0) && !view.line.covers(*at);
+        let alive = self.landmarks.iter().filter(|(_, landmark)| !landmark.dead);
+        alive
+            .filter_map(|(id, landmark)| Some((*id, landmark.seen_at(&self.rig.camera, pose)?)))
+            .filter(|(_, at)| inside(at))
+            .collect()
+    }
+
+    fn probe(&mut self, view: &View3<'_>, pose: &Isometry3<f64>) -> bool {
+        let visible = self.visible(view, pose);
+        let step = visible.len().div_ceil(PROBES).max(1);
+        let probes: Vec<_> = visible.into_iter().step_by(step).collect();
+        let found = probes.iter().filter(|(id, at)| {
+            let Some(landmark) = self.landmarks.get_mut(id) else { return false };
+            let found = landmark.find(view.gray, &self.rig.camera, pose, *at, *at, NEAR_PX);
+            found.is_some_and(|f| f.likeness >= LEAST_LIKENESS)
+        });
+        found.count() as f64 >= PROBES_FOUND * probes.len() as f64
+    }
+
+    /// A pose from the shrunk image, and where in the full one it shows each landmark, both good to about a pixel.
+    fn coarse_pose(
+        &self,
+        view: &View3<'_>,
+        start: &Isometry3<f64>,
+    ) -> Option<(Isometry3<f64>, HashMap<u32, (f64, f64)>)> {
+        let small = view.small();
+        let visible = self.visible(view, start);
+        let found: Vec<(u32, (f64, f64), [f64; 2])> = visible
+            .into_iter()
+            .filter_map(|(id, at)| {
+                let found = self.landmarks.get(&id)?.find_small(small, at, NEAR_SMALL_PX)?;
+                let off = [f64::from(found.x) - at.0, f64::from(found.y) - at.1];
+                (found.likeness >= LEAST_LIKENESS_SMALL).then_some((id, at, off))
+            })
+            .collect();
+        if found.len() < FEWEST_SIGHTS {
+            return None;
+        }
+        let places: HashMap<u32, (f64, f64)> =
+            found.iter().map(|(id, at, off)| (*id, (at.0 + off[0], at.1 + off[1]))).collect();
+        let sights: Vec<Sight> =
+            found.iter().filter_map(|(id, ..)| self.sight(*id, places[id], COARSE_SIGMA_PX, start)).collect();
+        let pose = pose::solve(start, &sights, hold(HOLD_RAD))?.camera_from_world;
+        Some((pose, places))
+    }
+
+    fn sight(&self, id: u32, at: (f64, f64), sigma_px: f64, pose: &Isometry3<f64>) -> Option<Sight> {
+        let landmark = self.landmarks.get(&id)?;
+        let camera = &self.rig.camera;
+        let ray = camera.undistort(RawPixel { u_px: at.0, v_px: at.1 });
+        // What is not known of the place itself counts as an error of its sight.
+        let p = pose * landmark.world;
+        let (_, _, by_point) = pose::projection(&p)?;
+        let rotation = pose.rotation.to_rotation_matrix();
+        let covariance = rotation.matrix() * landmark.covariance * rotation.matrix().transpose();
+        let own: f64 = by_point.iter().map(|row| Vector3::from(*row)).map(|row| row.dot(&(covariance * row))).sum();
+        let sigma = sigma_px / camera.fx_px;
+        Some(Sight { landmark: id, world: landmark.world, ray: [ray.x, ray.y], sigma: (sigma * sigma + own / 2.0).sqrt() })
+    }
+
+    /// Finds the landmarks near where the pose puts them, or where `places` says, and solves the pose.
+    fn solve_frame(
+        &mut self,
+        view: &View3<'_>,
+        start: &Isometry3<f64>,
+        places: &HashMap<u32, (f64, f64)>,
+    ) -> Option<Followed> {
+        let visible = self.visible(view, start);
+        let (mut sights, mut seen) = (Vec::new(), Vec::new());
+        let mut found: Vec<(u32, Option<Found>)> = Vec::with_capacity(visible.len());
+        for (id, at) in &visible {
+            let camera = &self.rig.camera;
+            let Some(landmark) = self.landmarks.get_mut(id) else { continue };
+            let near = places.get(id).copied().unwrap_or(*at);
+            let place = landmark.find(view.gray, camera, start, *at, near, NEAR_PX);
+            found.push((*id, place.filter(|f| f.likeness >= LEAST_LIKENESS)));
+        }
+        if (found.iter().filter(|(_, f)| f.is_some()).count() as f64) < FOUND_SHARE * found.len() as f64 {
+            for ((id, place), (_, at)) in found.iter_mut().zip(&visible).filter(|((_, place), _)| place.is_none()) {
+                let near = places.get(id).copied().unwrap_or(*at);
+                let coarse = self.landmarks.get(id).and_then(|l| l.find_small(view.small(), near, NEAR_PX));
+                *place = coarse.filter(|f| f.likeness >= LEAST_LIKENESS_SMALL);
+            }
+        }
+        for (id, found) in found {
+            let Some(landmark) = self.landmarks.get_mut(&id) else { continue };
+            let Some(found) = found else {
+                landmark.misses += 1;
+                landmark.dead = landmark.misses > MISSES;
+                continue;
+            };
+            let sigma_px = f64::from(found.sigma).clamp(SIGMA_PX.0, SIGMA_PX.1);
+            if let Some(sight) = self.sight(id, (f64::from(found.x), f64::from(found.y)), sigma_px, start) {
+                sights.push(sight);
+                seen.push((found.x, found.y));
+            }
+        }
+        if std::env::var("STRIA_DBG").is_ok() {
+            eprintln!("frame {} sights {} of {}", view.frame, sights.len(), self.landmarks.values().filter(|l| !l.dead).count());
+        }
+        if sights.len() < FEWEST_SIGHTS {
+            return None;
+        }
+        let mut solved = pose::solve(start, &sights, hold(HOLD_RAD))?;
+        let mut degrees_of_freedom = 6;
+        if rotation_sigma(&solved.information) > ROTATION_SIGMA_RAD {
+            degrees_of_freedom = 3;
+            solved = pose::solve(start, &sights, hold(HOLD_FIRM_RAD))?;
+        }
+        let pose = solved.camera_from_world;
+        let (mut good, mut places) = (Vec::new(), HashMap::new());
+        for (sight, at) in sights.into_iter().zip(seen) {
+            let Some(landmark) = self.landmarks.get_mut(&sight.landmark) else { continue };
+            if pose::misfit(&pose, &sight) > OUTLIER {
+                landmark.misses += 1;
+                landmark.dead = landmark.misses > MISSES;
+                continue;
+            }
+            landmark.misses = 0;
+            landmark.last_frame = view.frame;
+            places.insert(sight.landmark, at);
+            good.push(sight);
+        }
+        if std::env::var("STRIA_DBG").is_ok() {
+            eprintln!("   good {} dof {} moved {:.4?}", good.len(), degrees_of_freedom, pose::difference(start, &pose).as_slice());
+        }
+        (good.len() >= FEWEST_SIGHTS).then_some(Followed { pose, sights: good, places, degrees_of_freedom })
+    }
+
+    /// Landmarks that the line passed over since the last frame get their depth from it.
+    fn cross_line(&mut self, view: &View3<'_>, pose: &Isometry3<f64>, rows: &[Option<Point3<f64>>], last: &Last) {
+        let Some(keyframe) = self.keyframes.back() else { return };
+        let from_keyframe = pose * keyframe.camera_from_world.inverse();
+        let before_to_now = pose * last.pose.inverse();
+        let number = keyframe.number;
+        for landmark in self.landmarks.values_mut().filter(|l| !l.dead) {
+            let at = landmark.seen_at(&self.rig.camera, pose);
+            let now_px = at.and_then(|at| view.line.distance_px(at));
+            let before_px = std::mem::replace(&mut landmark.from_line_px, now_px);
+            let (Some(at), Some(now_px), Some(before_px)) = (at, now_px, before_px) else { continue };
+            let jump_px = now_px - before_px;
+            if now_px.signum() == before_px.signum() || jump_px.abs() > 0.2 * f64::from(self.rig.camera.width_px) {
+                continue;
+            }
+            let (along, _) = view.line.axes(at);
+            let (Some(now), Some(before)) = (nearby(rows, along), nearby(&last.profile, along)) else { continue };
+            let before = before_to_now * before;
+            let share = before_px / (before_px - now_px);
+            let z_mm = before.z + share * (now.z - before.z);
+            // An edge between the two profiles: the place could be on either side.
+            if (now.z - before.z).abs() > 0.02 * z_mm {
+                continue;
+            }
+            let rotation = from_keyframe.rotation.inverse();
+            let depth = PlaceDepth {
+                view: 0,
+                direction: rotation * Vector3::z(),
+                distance_mm: z_mm - from_keyframe.translation.z,
+                sigma_mm: STRIPE_SIGMA_PX * self.rig.depth_step_mm(z_mm),
+            };
+            landmark.depths.retain(|(_, d)| d.sigma_mm < 0.01 * z_mm);
+            landmark.depths.push((number, depth));
+            landmark.measured = true;
+        }
+    }
+
+    fn add_keyframe(&mut self, pose: Isometry3<f64>, sights: &[Sight]) {
+        let number = self.next_keyframe;
+        self.next_keyframe += 1;
+        self.keyframes.push_back(Keyframe { number, camera_from_world: pose, fixed: false });
+        for sight in sights {
+            let sigma = self.plain_sigma(sight);
+            if let Some(landmark) = self.landmarks.get_mut(&sight.landmark) {
+                landmark.sights.push((number, PlaceSight { view: 0, ray: sight.ray, sigma }));
+            }
+        }
+        let keep = 2 * self.options.window as usize;
+        while self.keyframes.len() > keep {
+            self.keyframes.pop_front();
+        }
+        let oldest = self.keyframes.front().map_or(0, |k| k.number);
+        for landmark in self.landmarks.values_mut() {
+            landmark.sights.retain(|(n, _)| *n >= oldest);
+            // A depth is worth keeping: it is carried on by the place itself once its key frame is gone.
+            landmark.depths.retain(|(n, _)| *n >= oldest);
+        }
+        let free = self.options.window as usize;
+        let count = self.keyframes.len();
+        for keyframe in self.keyframes.iter_mut().take(count.saturating_sub(free)) {
+            keyframe.fixed = true;
+        }
+    }
+
+    /// A sight's own error, without that of the place.
+    fn plain_sigma(&self, sight: &Sight) -> f64 {
+        sight.sigma.clamp(SIGMA_PX.0 / self.rig.camera.fx_px, 0.15 / self.rig.camera.fx_px)
+    }
+
+    fn adjust(&mut self, rounds: usize) {
+        let oldest = self.keyframes.front().map_or(0, |k| k.number);
+        let index = |number: u32| (number - oldest) as usize;
+        let mut views: Vec<View> =
+            self.keyframes.iter().map(|k| View { camera_from_world: k.camera_from_world, free: !k.fixed }).collect();
+        let newest_fixed = self.keyframes.iter().rev().find(|k| k.fixed).map_or(0, |k| k.number);
+        let (mut ids, mut places) = (Vec::new(), Vec::new());
+        for (id, landmark) in self.landmarks.iter().filter(|(_, l)| !l.dead) {
+            // What no free key frame saw cannot change.
+            let recent = landmark.sights.last().is_some_and(|(n, _)| *n > newest_fixed);
+            if !recent || landmark.sights.len() + landmark.depths.len() < 2 {
+                continue;
+            }
+            ids.push(*id);
+            places.push(Place {
+                world: landmark.world,
+                sights: landmark.sights.iter().map(|(n, s)| PlaceSight { view: index(*n), ..*s }).collect(),
+                depths: landmark.depths.iter().map(|(n, d)| PlaceDepth { view: index(*n), ..*d }).collect(),
+                covariance: landmark.covariance,
+            });
+        }
+        let dbg = std::env::var("STRIA_DBG").is_ok();
+        let before = views.last().map(|v| v.camera_from_world);
+        bundle::adjust(&mut views, &mut places, rounds);
+        if dbg {
+            let d = pose::difference(&before.unwrap(), &views.last().unwrap().camera_from_world);
+            let c = bundle::total_cost(&views, &places);
+            let n: usize = places.iter().map(|p| p.sights.len()).sum();
+            eprintln!("BA kf {} free {} places {} obs {} cost/obs {:.3} moved {:.4?}", views.len(), views.iter().filter(|v| v.free).count(), places.len(), n, c / n as f64, d.as_slice());
+        }
+        for (keyframe, view) in self.keyframes.iter_mut().zip(views) {
+            keyframe.camera_from_world = view.camera_from_world;
+        }
+        for (id, place) in ids.into_iter().zip(places) {
+            if let Some(landmark) = self.landmarks.get_mut(&id) {
+                landmark.world = place.world;
+                landmark.covariance = place.covariance;
+            }
+        }
+    }
+
+    /// New landmarks where the image has none.
+    fn choose_landmarks(&mut self, view: &View3<'_>, profile: &Profile, pose: &Isometry3<f64>) {
+        let camera = self.rig.camera.clone();
+        let (width, height) = (view.gray.width, view.gray.height);
+        let side = ((width * height) as f64 / f64::from(self.options.landmarks)).sqrt().max(24.0);
+        let (columns, rows) = ((width as f64 / side).round() as usize, (height as f64 / side).round() as usize);
+        let (columns, rows) = (columns.max(1), rows.max(1));
+        let mut taken = vec![false; columns * rows];
+        let mut known = self.known_depths(profile, pose);
+        for landmark in self.landmarks.values().filter(|l| !l.dead) {
+            let Some((x, y)) = landmark.seen_at(&camera, pose) else { continue };
+            if x >= 0.0 && y >= 0.0 && x < width as f64 && y < height as f64 {
+                let cell = (y as usize * rows / height) * columns + x as usize * columns / width;
+                taken[cell.min(columns * rows - 1)] = true;
+            }
+        }
+        if known.len() > 400 {
+            let step = known.len() / 400 + 1;
+            known = known.into_iter().step_by(step).collect();
+        }
+        let along = match self.rig.laser.line {
+            LineDirection::Vertical => 1,
+            LineDirection::Horizontal => 0,
+        };
+        let number = self.keyframes.back().map_or(0, |k| k.number);
+        let world_from_camera = pose.inverse();
+        for cell in (0..columns * rows).filter(|cell| !taken[*cell]) {
+            let (column, row) = (cell % columns, cell / columns);
+            let across = column * width / columns..(column + 1) * width / columns;
+            let down = row * height / rows..(row + 1) * height / rows;
+            let clear = |x: usize, y: usize| !view.line.covers((x as f64, y as f64));
+            let least = self.options.texture_min as f32;
+            let Some((x, y)) = best_place(view.small(), across, down, least, clear) else { continue };
+            let ray = camera.undistort(RawPixel { u_px: x as f64, v_px: y as f64 });
+            let ray = [ray.x, ray.y];
+            let Some(guess) = depth::guess(&known, ray, along) else { continue };
+            let inverse_at = |r: [f64; 2]| {
+                let slope = guess.slopes[0] * (r[0] - ray[0]) + guess.slopes[1] * (r[1] - ray[1]);
+                (guess.inverse_mm + slope).max(0.3 * guess.inverse_mm)
+            };
+            let chosen = Landmark::choose(view.gray, view.small(), (x, y), &camera, &world_from_camera, inverse_at);
+            let Some(mut landmark) = chosen else { continue };
+            let z_mm = 1.0 / guess.inverse_mm;
+            let sigma_mm = guess.sigma_share * z_mm;
+            let sight_sigma = SIGMA_PX.0 / camera.fx_px;
+            let direction = world_from_camera.rotation * Vector3::new(ray[0], ray[1], 1.0);
+            landmark.covariance = direction * direction.transpose() * (sigma_mm * sigma_mm)
+                + Matrix3::identity() * (sight_sigma * z_mm).powi(2);
+            landmark.sights.push((number, PlaceSight { view: 0, ray, sigma: sight_sigma }));
+            let depth = PlaceDepth { view: 0, direction: Vector3::z(), distance_mm: z_mm, sigma_mm };
+            landmark.depths.push((number, depth));
+            landmark.last_frame = view.frame;
+            self.landmarks.insert(self.next_landmark, landmark);
+            self.next_landmark += 1;
+        }
+    }
+
+    /// Depths in this view: the profile's, and those of landmarks that are sure.
+    fn known_depths(&self, profile: &Profile, pose: &Isometry3<f64>) -> Vec<Known> {
+        let of = |p: &Point3<f64>| Known { ray: [p.x / p.z, p.y / p.z], inverse_mm: 1.0 / p.z };
+        let step = (profile.points.len() / 60).max(1);
+        let mut known: Vec<Known> = profile.points.iter().step_by(step).map(|p| of(&p.point_in_camera)).collect();
+        for landmark in self.landmarks.values().filter(|l| !l.dead) {
+            let p = pose * landmark.world;
+            if p.z > 1.0 && landmark.covariance.trace().sqrt() < SURE_SHARE * p.z {
+                known.push(of(&p));
+            }
+        }
+        known
+    }
+
+    fn alive_places(&self, pose: &Isometry3<f64>) -> HashMap<u32, (f32, f32)> {
+        let place = |landmark: &Landmark| landmark.seen_at(&self.rig.camera, pose);
+        let alive = self.landmarks.iter().filter(|(_, l)| !l.dead);
+        alive.filter_map(|(id, l)| place(l).map(|(x, y)| (*id, (x as f32, y as f32)))).collect()
+    }
+
+    fn wait(&mut self, frame: u32, pose: Option<Isometry3<f64>>, sights: Vec<Sight>, degrees_of_freedom: u8) {
+        let keyframe = self.next_keyframe;
+        self.waiting.push_back(Waiting { frame, pose, sights, keyframe, part: self.part, degrees_of_freedom });
+        if self.keyframes.is_empty() {
+            self.settle_all_without_pose();
+        }
+    }
+
+    /// Frames before the first key frame have no pose and never get one.
+    fn settle_all_without_pose(&mut self) {
+        while self.waiting.front().is_some_and(|w| w.pose.is_none()) {
+            if let Some(waiting) = self.waiting.pop_front() {
+                self.settle(waiting);
+            }
+        }
+    }
+
+    fn settle_all(&mut self) {
+        while let Some(waiting) = self.waiting.pop_front() {
+            self.settle(waiting);
+        }
+    }
+
+    /// Frames whose following key frame is fixed are done.
+    fn settle_finished(&mut self) {
+        let newest_fixed = self.keyframes.iter().rev().find(|k| k.fixed).map_or(0, |k| k.number);
+        while self.waiting.front().is_some_and(|w| w.keyframe <= newest_fixed) {
+            if let Some(waiting) = self.waiting.pop_front() {
+                self.settle(waiting);
+            }
+        }
+    }
+
+    /// The pose once more, now that the landmarks are where they are.
+    fn settle(&mut self, waiting: Waiting) {
+        let pose = waiting.pose.map(|pose| {
+            let sights: Vec<Sight> = waiting
+                .sights
+                .iter()
+                .filter_map(|s| {
+                    let landmark = self.landmarks.get(&s.landmark)?;
+                    Some(Sight { world: landmark.world, sigma: self.plain_sigma(s), ..*s })
+                })
+                .collect();
+            if sights.len() < FEWEST_SIGHTS {
+                return pose;
+            }
+            let held = if waiting.degrees_of_freedom == 6 { HOLD_RAD } else { HOLD_FIRM_RAD };
+            pose::solve(&pose, &sights, hold(held)).map_or(pose, |solved| solved.camera_from_world)
+        });
+        self.settled.push(SettledPose {
+            frame: waiting.frame,
+            world_from_camera: pose.map(|p| p.inverse()),
+            part: waiting.part,
+            degrees_of_freedom: waiting.degrees_of_freedom,
+        });
+    }
+
+    /// Drops landmarks that nothing needs any more.
+    fn prune(&mut self, frame: u32) {
+        let oldest_waiting = self.waiting.front().map_or(frame, |w| w.frame);
+        self.landmarks.retain(|_, l| l.last_frame >= oldest_waiting || (!l.dead && l.measured));
+        let mut out_of_sight: Vec<(u32, u32)> = self
+            .landmarks
+            .iter()
+            .filter(|(_, l)| l.last_frame < oldest_waiting)
+            .map(|(id, l)| (l.last_frame, *id))
+            .collect();
+        out_of_sight.sort_unstable();
+        for (_, id) in out_of_sight.iter().take(out_of_sight.len().saturating_sub(DORMANT)) {
+            self.landmarks.remove(id);
+        }
+    }
+}
+
+/// Information that keeps a pose near its start.
+fn hold(rotation_rad: f64) -> [f64; 2] {
+    [1.0 / (rotation_rad * rotation_rad), 1.0 / (HOLD_MM * HOLD_MM)]
+}
+
+/// Largest standard deviation of the rotation, radians.
+fn rotation_sigma(information: &nalgebra::Matrix6<f64>) -> f64 {
+    let Some(covariance) = information.try_inverse() else { return f64::MAX };
+    (0..3).map(|i| covariance[(i, i)].max(0.0).sqrt()).fold(0.0, f64::max)
+}
+
+/// The image's motion from the landmarks that both frames saw.
+fn shift_between(before: &HashMap<u32, (f32, f32)>, now: &HashMap<u32, (f32, f32)>) -> Shift {
+    let mut ids: Vec<u32> = now.keys().copied().filter(|id| before.contains_key(id)).collect();
+    ids.sort_unstable();
+    let corners: Vec<TrackedCorner> = ids
+        .iter()
+        .map(|id| TrackedCorner { from_px: [before[id].0, before[id].1], to_px: [now[id].0, now[id].1] })
+        .collect();
+    if corners.len() < FEWEST_CORNERS {
+        return Shift { corners, ..Shift::default() };
+    }
+    let along = |axis: usize| {
+        let mut values: Vec<f64> =
+            corners.iter().map(|c| f64::from(c.to_px[axis]) - f64::from(c.from_px[axis])).collect();
+        median(&mut values)
+    };
+    let (dx, dy) = (along(0), along(1));
+    let (scale, residual_px) = scale_and_residual(&corners);
+    Shift { dx_px: Some(dx), dy_px: Some(dy), scale, residual_px: Some(residual_px), corners }
+}
+
+/// The profile with a place for each line position.
+fn dense(profile: &Profile, positions: usize) -> Vec<Option<Point3<f64>>> {
+    let mut rows = vec![None; positions];
+    for point in &profile.points {
+        if let Some(row) = rows.get_mut(point.line_position as usize) {
+            *row = Some(point.point_in_camera);
+        }
+    }
+    rows
+}
+
+/// The point of middle depth around a line position.
+fn nearby(rows: &[Option<Point3<f64>>], along: f64) -> Option<Point3<f64>> {
+    let at = along.round() as i64;
+    let mut near: Vec<Point3<f64>> = (at - DEPTH_REACH..=at + DEPTH_REACH)
+        .filter_map(|i| usize::try_from(i).ok().and_then(|i| rows.get(i).copied().flatten()))
+        .collect();
+    near.sort_by(|a, b| a.z.total_cmp(&b.z));
+    (near.len() >= 3).then(|| near[near.len() / 2])
+}

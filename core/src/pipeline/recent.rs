@@ -1,0 +1,124 @@
+//! The last frames, for what the frame at hand hides under the laser: the wall's own look.
+
+use std::collections::VecDeque;
+use std::sync::Arc;
+
+use nalgebra::{Isometry3, Point3};
+
+use crate::rig::{Camera, LineDirection, Rig};
+use crate::source::{Image, Yuv};
+use crate::stripe::Stripe;
+use crate::stripe::metric::Wall;
+use crate::triangulation::Profile;
+
+/// Frames that are kept, at most.
+const MAX_FRAMES: usize = 8;
+/// A frame is kept when the image has moved this far since the last kept one, px.
+const STEP_PX: f64 = 6.0;
+/// Share of the line that must lie clear of the laser in an earlier frame.
+const CLEAR_SHARE: f64 = 0.8;
+
+/// A frame that may show the wall without the laser.
+pub(super) struct Recent {
+    image: Arc<Image>,
+    camera_from_world: Isometry3<f64>,
+    /// The line's place at each line position or its neighbours', px; empty where there was none.
+    line_px: Vec<f32>,
+    line: LineDirection,
+}
+
+impl Recent {
+    pub(super) fn new(image: Arc<Image>, camera_from_world: Isometry3<f64>, stripe: &Stripe) -> Recent {
+        let mut line_px = stripe.across_px.clone();
+        let mut last = line_px.iter().copied().find(|x| x.is_finite());
+        if last.is_none() {
+            line_px.clear();
+        }
+        for x in &mut line_px {
+            match (x.is_finite(), last) {
+                (true, _) => last = Some(*x),
+                (false, Some(last)) => *x = last,
+                (false, None) => {}
+            }
+        }
+        Recent { image, camera_from_world, line_px, line: stripe.line }
+    }
+
+    /// Its luma and chroma.
+    pub(super) fn yuv(&self) -> Yuv<'_> {
+        self.image.yuv()
+    }
+
+    /// Where it shows a place of the world, (across, along) px, unless the laser falls within `margin_px` of it.
+    pub(super) fn clear_place(&self, camera: &Camera, world: &Point3<f64>, margin_px: f32) -> Option<(f32, f32)> {
+        let p = self.camera_from_world * world;
+        if p.z < 1.0 {
+            return None;
+        }
+        let pixel = camera.project(&p);
+        let (u, v) = (pixel.u_px as f32, pixel.v_px as f32);
+        let (across, along) = match self.line {
+            LineDirection::Vertical => (u, v),
+            LineDirection::Horizontal => (v, u),
+        };
+        let inside = u >= 0.0 && v >= 0.0 && u < (camera.width_px - 1) as f32 && v < (camera.height_px - 1) as f32;
+        let lit = self.line_px.get(along.round().max(0.0) as usize).is_some_and(|line| (line - across).abs() < margin_px);
+        (inside && !lit).then_some((across, along))
+    }
+}
+
+/// The last frames, the newest last.
+#[derive(Default)]
+pub(super) struct RecentFrames {
+    frames: VecDeque<Recent>,
+    moved_px: f64,
+}
+
+impl RecentFrames {
+    /// Keeps a frame if the image has moved far enough (`moved_px` since the frame before).
+    pub(super) fn push(&mut self, moved_px: f64, frame: impl FnOnce() -> Recent) {
+        self.moved_px += moved_px;
+        if self.frames.is_empty() || self.moved_px >= STEP_PX {
+            self.moved_px = 0.0;
+            self.frames.push_back(frame());
+            if self.frames.len() > MAX_FRAMES {
+                self.frames.pop_front();
+            }
+        }
+    }
+
+    /// The newest.
+    pub(super) fn newest(&self) -> Option<&Recent> {
+        self.frames.back()
+    }
+
+    /// Forgets all: the way is broken.
+    pub(super) fn clear(&mut self) {
+        self.frames.clear();
+    }
+
+    /// The newest frame that shows most of a profile's places clear of the laser, with these places.
+    pub(super) fn wall(
+        &self,
+        rig: &Rig,
+        profile: &Profile,
+        camera_from_world: &Isometry3<f64>,
+        positions: usize,
+        margin_px: f32,
+    ) -> Option<(&Recent, Wall<'_>)> {
+        let world_from_camera = camera_from_world.inverse();
+        let place = |recent: &Recent, p: &Point3<f64>| recent.clear_place(&rig.camera, &(world_from_camera * p), margin_px);
+        let step = (profile.points.len() / 24).max(1);
+        let probes: Vec<&Point3<f64>> = profile.points.iter().step_by(step).map(|p| &p.point_in_camera).collect();
+        let clear = |recent: &&Recent| {
+            let clear = probes.iter().filter(|p| place(recent, p).is_some()).count();
+            !probes.is_empty() && clear as f64 >= CLEAR_SHARE * probes.len() as f64
+        };
+        let recent = self.frames.iter().rev().find(clear)?;
+        let mut places = vec![None; positions];
+        for point in &profile.points {
+            places[point.line_position as usize] = place(recent, &point.point_in_camera);
+        }
+        Some((recent, Wall { image: recent.yuv(), places }))
+    }
+}

@@ -1,0 +1,373 @@
+//! The stripe, measured: colour evidence says where the line is, the light's own profile where its centre lies.
+//!
+//! ```text
+//! Yuv ▶ evidence (colour ridges, chroma only) ▶ choice ▶ spots (luma, plain) ▶ Seen
+//! Seen + the wall as it looks without the laser ▶ spots ▶ smoothing along the line ▶ Stripe with σ
+//! ```
+//!
+//! The centre comes from the luma alone. Encoders halve the chroma and do not agree on where its samples lie: using
+//! it moves the centre by a constant 0.08 px and more, which is a constant error in every depth. Luma is full-size and
+//! its place is certain. It is turned into light first, the surroundings are taken off, and the centroid under a
+//! Gaussian window finds the centre of a line whose core may be clipped: clipping is as symmetric as the line.
+//!
+//! What then remains is mostly the wall's own pattern under the line. Dividing by the same strip of wall as an
+//! earlier frame saw it, without the laser, takes most of that away ([`Wall`]); smoothing along the line, never across
+//! an edge, takes some of the rest.
+
+mod evidence;
+mod smoothing;
+mod spot;
+
+use crate::recipe::SpotOptions;
+use crate::rig::{Laser, LineDirection};
+use crate::source::{PlaneView, Yuv};
+use crate::stripe::Stripe;
+use crate::stripe::choice::{self, Candidate};
+use spot::{Background, SpotShape};
+
+/// Line positions that share one search for colour: two rows of chroma.
+const GROUP: usize = evidence::GROUP;
+/// Width of the line at half its height that is assumed before the first frame, as a share of the image's width.
+const FIRST_WIDTH_SHARE: f32 = 1.0 / 160.0;
+/// Narrowest and widest line that is measured, px at half its height.
+const WIDTH_RANGE_PX: (f32, f32) = (2.0, 60.0);
+/// Share of a frame's own line width in the width that the next frame expects.
+const WIDTH_GAIN: f32 = 0.2;
+/// A spot may lie this far from where the colour is: at least, px, and as a share of the line's width.
+const OFF_COLOUR_PX: f32 = 3.0;
+const OFF_COLOUR_WIDTHS: f32 = 0.4;
+/// Standard deviation of a place that only the colour tells, px: chroma has half the image's size.
+const COLOUR_SIGMA_PX: f32 = 2.0;
+/// Shortest piece of the line that the colour is believed in, groups; the spots themselves then need more.
+const PIECE_MIN_GROUPS: usize = 2;
+/// Groups on each side that say where the line goes on.
+const LINE_REACH: usize = 10;
+/// Two candidates closer than this are one, px.
+const SAME_START_PX: f32 = 3.0;
+
+/// Finds the stripe frame by frame; remembers how wide the line is.
+pub struct StripeFinder {
+    laser: Laser,
+    options: SpotOptions,
+    width_px: Option<f32>,
+}
+
+/// The line as one frame shows it, before the wall's own pattern is taken out.
+pub struct Seen {
+    /// The line, spot by spot, not smoothed; its σ is that of a spot on an even wall.
+    pub stripe: Stripe,
+    /// Light along each line position around its spot, [`Seen::samples`] values each.
+    light: Vec<f32>,
+    /// First sample of each line position.
+    starts: Vec<i32>,
+    shape: SpotShape,
+}
+
+/// The wall without the laser: an earlier frame and where in it each spot's place on the wall lies.
+pub struct Wall<'a> {
+    /// The earlier frame.
+    pub image: Yuv<'a>,
+    /// For each line position: (across, along) in that frame, px; `None` where the place is unknown, out of the image
+    /// or lit by the laser in that frame too.
+    pub places: Vec<Option<(f32, f32)>>,
+}
+
+impl StripeFinder {
+    /// A finder that has seen nothing.
+    pub fn new(laser: &Laser, options: &SpotOptions) -> StripeFinder {
+        StripeFinder { laser: laser.clone(), options: options.clone(), width_px: None }
+    }
+
+    /// Finds the line in a frame.
+    pub fn see(&mut self, image: Yuv<'_>) -> Seen {
+        let mut candidates =
+            evidence::ridges(image, self.laser.colour, self.laser.line, self.options.evidence_min as f32);
+        // The choice counts in steps from row to row: here a row is a group of them.
+        let group = GROUP as f32;
+        candidates.iter_mut().flatten().for_each(|c| c.across_px /= group);
+        let mut chosen = choice::choose(&candidates, self.options.choice, PIECE_MIN_GROUPS);
+        chosen.iter_mut().flatten().for_each(|c| c.across_px *= group);
+        let luma = Lines::of(image, self.laser.line);
+        let first_width_px = FIRST_WIDTH_SHARE * image.width_px().max(image.height_px()) as f32;
+        let mut width_px = self.width_px.unwrap_or(first_width_px);
+        let mut seen = self.spots(&luma, image.light(), &chosen, width_px);
+        // The first frame tells the width: look again with it.
+        for _ in 0..if self.width_px.is_none() { 2 } else { 1 } {
+            let Some(found_px) = seen.median_width_px() else { return seen };
+            let first = self.width_px.is_none();
+            width_px = if first { found_px } else { width_px + WIDTH_GAIN * (found_px - width_px) };
+            width_px = width_px.clamp(WIDTH_RANGE_PX.0, WIDTH_RANGE_PX.1);
+            if first {
+                seen = self.spots(&luma, image.light(), &chosen, width_px);
+            }
+        }
+        self.width_px = Some(width_px);
+        seen
+    }
+
+    fn spots(&self, luma: &Lines<'_>, light: &[f32; 256], chosen: &[Option<Candidate>], width_px: f32) -> Seen {
+        let shape = SpotShape::new(width_px);
+        let (positions, samples) = (luma.positions, shape.samples());
+        let mut seen = Seen {
+            stripe: Stripe::empty(self.laser.line, positions),
+            light: vec![0.0; positions * samples],
+            starts: vec![0; positions],
+            shape,
+        };
+        let contrast_min = self.options.contrast_min as f32 / 255.0;
+        let line = line_around(chosen);
+        for position in 0..positions {
+            let Some(start) = strongest_start(luma, light, chosen, &line, position, width_px) else { continue };
+            let first = start.centre - seen.shape.half as i32;
+            if first < 0 || first as usize + samples > luma.length {
+                continue;
+            }
+            seen.starts[position] = first;
+            let profile = &mut seen.light[position * samples..][..samples];
+            luma.read(position, first as usize, light, profile);
+            let spot = seen.shape.find(profile, Background::Sides, seen.shape.half as f32);
+            // The brightest place may be a glint beside the line: it is not where the colour is.
+            let largest_px = OFF_COLOUR_PX.max(OFF_COLOUR_WIDTHS * width_px);
+            let spot = spot.filter(|spot| (first as f32 + spot.at - start.expected_px).abs() <= largest_px);
+            let (at, sigma, height) = match spot {
+                // A weak spot is no spot. Light is compared as the eye and the encoder do: relative to where it stands.
+                Some(spot) if spot.height >= contrast_min * (0.15 + 2.0 * spot.background) => {
+                    (first as f32 + spot.at, spot.sigma, spot.height)
+                }
+                Some(_) => continue,
+                None if start.coloured => (start.expected_px, COLOUR_SIGMA_PX, contrast_min),
+                None => continue,
+            };
+            seen.stripe.across_px[position] = at;
+            seen.stripe.sigma_px[position] = sigma;
+            seen.stripe.confidence[position] = height.min(1.0);
+        }
+        seen
+    }
+}
+
+/// The stripe with all that is known: the wall without the laser where another frame saw it, and smoothed along the line.
+pub fn measure_stripe(seen: &Seen, wall: Option<&Wall<'_>>, options: &SpotOptions) -> Stripe {
+    let mut stripe = seen.stripe.clone();
+    if let Some(wall) = wall.filter(|_| options.wall_reference) {
+        divide_by_wall(seen, wall, &mut stripe);
+    }
+    smoothing::smooth(&mut stripe, options);
+    stripe
+}
+
+impl Seen {
+    /// Width of the line at half its height, px, as the spots were looked for.
+    pub fn width_px(&self) -> f32 {
+        self.shape.width_px
+    }
+
+    /// Distance from the line within which another frame's laser must not fall to show the wall, px.
+    pub fn reach_px(&self) -> f32 {
+        2.0 * self.shape.half as f32
+    }
+
+    fn samples(&self) -> usize {
+        self.shape.samples()
+    }
+
+    fn profile(&self, position: usize) -> &[f32] {
+        &self.light[position * self.samples()..][..self.samples()]
+    }
+
+    /// Median width of the line at half its height, px; `None` where there is no line.
+    fn median_width_px(&self) -> Option<f32> {
+        let found = |position: &usize| self.stripe.across_px[*position].is_finite();
+        let mut widths: Vec<f32> = (0..self.starts.len())
+            .step_by(4)
+            .filter(found)
+            .filter_map(|position| {
+                self.shape.width_px(self.profile(position), self.stripe.across_px[position] - self.starts[position] as f32)
+            })
+            .collect();
+        let middle = widths.len() / 2;
+        (!widths.is_empty()).then(|| *widths.select_nth_unstable_by(middle, f32::total_cmp).1)
+    }
+}
+
+/// Where to look for a spot.
+struct Start {
+    /// Where the colour, or the line above and below, says it is, px.
+    expected_px: f32,
+    /// The whole pixel to look around.
+    centre: i32,
+    /// The colour says so.
+    coloured: bool,
+}
+
+/// The start with the most light around it, of those that this group, its neighbours and the line above and below give:
+/// at an edge of the wall the line jumps inside a group, and under a lamp of its own colour it shows by its light only.
+fn strongest_start(
+    luma: &Lines<'_>,
+    light: &[f32; 256],
+    chosen: &[Option<Candidate>],
+    line: &[Option<f32>],
+    position: usize,
+    width_px: f32,
+) -> Option<Start> {
+    let group = position / GROUP;
+    let at = |group: Option<usize>| group.and_then(|g| chosen.get(g)).copied().flatten().map(|c| c.across_px);
+    let own = at(Some(group));
+    // Neighbours only help where the group itself knows something: a gap's edge is not widened by them.
+    let beside = own.is_some().then(|| [at(group.checked_sub(1)), at(Some(group + 1))]).unwrap_or_default();
+    let starts = [own, beside[0], beside[1], line.get(group).copied().flatten()];
+    let mut best: Option<(f32, f32)> = None;
+    for (i, start) in starts.iter().enumerate() {
+        let Some(expected_px) = *start else { continue };
+        if starts[..i].iter().flatten().any(|tried| (tried - expected_px).abs() < SAME_START_PX) {
+            continue;
+        }
+        let Some((peak, score)) = luma.brightest(position, expected_px, width_px, light) else { continue };
+        if best.is_none_or(|(_, most)| score > most) {
+            best = Some((peak, score));
+        }
+    }
+    let (peak, _) = best?;
+    // From another start the same peak may be found: what counts is the nearest.
+    let away = |start: &Option<f32>| start.map_or(f32::MAX, |px| (px - peak).abs());
+    let nearest = (0..starts.len()).min_by(|a, b| away(&starts[*a]).total_cmp(&away(&starts[*b])))?;
+    Some(Start { expected_px: starts[nearest]?, centre: peak.round() as i32, coloured: nearest < 3 })
+}
+
+/// For each group where the line above and below says it is: between its nearest places where the group has none, else
+/// the middle of the places around it. Only where the line is known on both sides.
+fn line_around(chosen: &[Option<Candidate>]) -> Vec<Option<f32>> {
+    let place = |group: usize| chosen[group].map(|c| c.across_px);
+    let mut near = Vec::with_capacity(2 * LINE_REACH + 1);
+    (0..chosen.len())
+        .map(|group| {
+            let (from, to) = (group.saturating_sub(LINE_REACH), (group + LINE_REACH + 1).min(chosen.len()));
+            let before = (from..group).rev().find_map(|g| Some((g, place(g)?)))?;
+            let after = (group + 1..to).find_map(|g| Some((g, place(g)?)))?;
+            if chosen[group].is_none() {
+                let share = (group - before.0) as f32 / (after.0 - before.0) as f32;
+                return Some(before.1 + share * (after.1 - before.1));
+            }
+            near.clear();
+            near.extend((from..to).filter_map(place));
+            let middle = near.len() / 2;
+            (near.len() > LINE_REACH / 2).then(|| *near.select_nth_unstable_by(middle, f32::total_cmp).1)
+        })
+        .collect()
+}
+
+/// Measures each spot again on the light divided by the wall's own pattern.
+fn divide_by_wall(seen: &Seen, wall: &Wall<'_>, stripe: &mut Stripe) {
+    let luma = Lines::of(wall.image, stripe.line);
+    let table = wall.image.light();
+    let samples = seen.samples();
+    let positions = seen.starts.len();
+    let mut pattern = vec![f32::NAN; positions * samples];
+    for (position, out) in pattern.chunks_exact_mut(samples).enumerate() {
+        let (Some(Some((across, along))), true) = (wall.places.get(position), stripe.across_px[position].is_finite())
+        else {
+            continue;
+        };
+        let offset = seen.starts[position] as f32 - stripe.across_px[position];
+        luma.read_between(*along, across + offset, table, out);
+    }
+    spot::soften(&mut pattern, samples);
+    let mut divided = vec![0.0; samples];
+    for position in 0..positions {
+        let pattern = &pattern[position * samples..][..samples];
+        if !stripe.across_px[position].is_finite() || !pattern[0].is_finite() {
+            continue;
+        }
+        let start = stripe.across_px[position] - seen.starts[position] as f32;
+        if !seen.shape.divide(seen.profile(position), pattern, &mut divided) {
+            continue;
+        }
+        if let Some(spot) = seen.shape.find(&divided, Background::None, start)
+            && (spot.at - start).abs() < 0.5 * seen.shape.width_px
+        {
+            stripe.across_px[position] = seen.starts[position] as f32 + spot.at;
+            // The pattern was most of the error: half of it is gone (measured on simulated concrete).
+            stripe.sigma_px[position] *= 0.6;
+        }
+    }
+}
+
+/// The luma as lines across the laser line: one per line position.
+struct Lines<'a> {
+    plane: PlaneView<'a>,
+    /// Bytes from one line position to the next.
+    along: usize,
+    /// Bytes from one sample across the line to the next.
+    across: usize,
+    positions: usize,
+    length: usize,
+}
+
+impl<'a> Lines<'a> {
+    fn of(image: Yuv<'a>, line: LineDirection) -> Lines<'a> {
+        let plane = image.luma();
+        let (width, height) = (image.width_px(), image.height_px());
+        match line {
+            LineDirection::Vertical => {
+                Lines { plane, along: plane.stride_bytes, across: 1, positions: height, length: width }
+            }
+            LineDirection::Horizontal => {
+                Lines { plane, along: 1, across: plane.stride_bytes, positions: width, length: height }
+            }
+        }
+    }
+
+    /// Light of `out.len()` samples from `first` on.
+    fn read(&self, position: usize, first: usize, light: &[f32; 256], out: &mut [f32]) {
+        let from = &self.plane.data[position * self.along + first * self.across..];
+        for (out, value) in out.iter_mut().zip(from.iter().step_by(self.across)) {
+            *out = light[usize::from(*value)];
+        }
+    }
+
+    /// The same between pixels; all NaN where it is not inside the image.
+    fn read_between(&self, along: f32, first: f32, light: &[f32; 256], out: &mut [f32]) {
+        let (row, column) = (along.floor(), first.floor());
+        let inside = row >= 0.0 && column >= 0.0;
+        if !inside || row as usize + 1 >= self.positions || column as usize + out.len() + 1 >= self.length {
+            out.fill(f32::NAN);
+            return;
+        }
+        let (share_along, share_across) = (along - row, first - column);
+        let at = row as usize * self.along + column as usize * self.across;
+        let (near, far) = (&self.plane.data[at..], &self.plane.data[at + self.along..]);
+        let value = |i: usize| {
+            let (a, b) = (light[usize::from(near[i * self.across])], light[usize::from(far[i * self.across])]);
+            a + share_along * (b - a)
+        };
+        let mut left = value(0);
+        for (i, out) in out.iter_mut().enumerate() {
+            let right = value(i + 1);
+            *out = left + share_across * (right - left);
+            left = right;
+        }
+    }
+
+    /// Where, within a line's width of `at`, most light falls on a line's width; and how much more than around it.
+    fn brightest(&self, position: usize, at: f32, width_px: f32, light: &[f32; 256]) -> Option<(f32, f32)> {
+        let core = (width_px * 0.5).clamp(1.0, 40.0) as i32;
+        let reach = (width_px * 1.2).clamp(4.0, 60.0) as i32;
+        let first = at.round() as i32 - reach - core;
+        let count = (2 * (reach + core) + 1) as usize;
+        if first < 0 || first as usize + count > self.length {
+            return None;
+        }
+        let mut sums = [0.0_f32; 256];
+        let from = &self.plane.data[position * self.along + first as usize * self.across..];
+        let mut sum = 0.0;
+        for (i, value) in from.iter().step_by(self.across).take(count).enumerate() {
+            sum += light[usize::from(*value)];
+            sums[i + 1] = sum;
+        }
+        let window = |centre: usize| sums[centre + 2 * core as usize + 1] - sums[centre];
+        let best = (0..=2 * reach as usize).max_by(|a, b| window(*a).total_cmp(&window(*b)))?;
+        let all = sums[count] / count as f32;
+        let score = window(best) / (2 * core + 1) as f32 - all;
+        Some(((first + core) as f32 + best as f32, score))
+    }
+}
