@@ -1,0 +1,361 @@
+//! Photos of a checkerboard with known truth: what `stria calibrate` wants, and what tests measure it by.
+//!
+//! Rendered by casting rays: several per pixel through the exact lens, onto the board or the wall behind it, with
+//! the laser's fan on both; then the lens' blur, the sensor's noise and curve.
+
+use std::fs;
+use std::path::Path;
+
+use nalgebra::{Isometry3, Point3, Rotation3, UnitQuaternion, Vector3};
+
+use super::bands::for_bands;
+use super::light::laser_rgb;
+use super::noise::{Stream, value_noise};
+use super::render::Pixel;
+use super::scene::SensorNoise;
+use super::sensor::Sensor;
+use super::write::{check_new, write_png};
+use crate::error::{Error, Result};
+use crate::geometry::{Plane, RawPixel, UndistortedRay};
+use crate::rig::{LineDirection, Rig};
+use crate::source::Image;
+
+/// Rays a pixel and side: with random places inside the cells, an edge is met to 0.01 px over a corner's window.
+const RAYS: usize = 4;
+/// The paper beyond the outer squares, squares wide.
+const RIM_SQUARES: f64 = 0.5;
+/// The wall behind the boards, mm from the camera.
+const WALL_MM: f64 = 1400.0;
+/// Distances of the boards from the camera, mm.
+const DISTANCE_MM: (f64, f64) = (380.0, 850.0);
+/// Largest tilt of a board, degrees.
+const TILT_DEG: f64 = 35.0;
+/// Every so many-th board is anywhere in the image, the others under the laser's line.
+const ANYWHERE: u32 = 3;
+
+/// A board, a rig and the light for photos.
+#[derive(Clone, Debug)]
+pub struct BoardScene {
+    /// The rig that takes the photos.
+    pub rig: Rig,
+    /// Inner corners a row.
+    pub columns: u32,
+    /// Inner corners a column.
+    pub rows: u32,
+    /// Side of a square, mm.
+    pub square_mm: f64,
+    /// Share of light that white and black squares give back.
+    pub albedo: (f64, f64),
+    /// Light of the room, full scales of the sensor on a white surface.
+    pub ambient: f64,
+    /// Light at the line's centre on a white surface at 600 mm, full scales.
+    pub laser_power: f64,
+    /// Width of the fan: standard deviation across its plane, mm.
+    pub line_sigma_mm: f64,
+    /// Blur of the lens: standard deviation, px.
+    pub blur_px: f64,
+    /// The sensor's noise.
+    pub noise: Option<SensorNoise>,
+    /// Makes one set of photos differ from another.
+    pub seed: u64,
+}
+
+impl BoardScene {
+    /// A board of 9x6 inner corners and 25 mm squares before a rig.
+    ///
+    /// # Errors
+    /// Image sizes outside 16 to 8192 px a side or above 8192x4320 px in all.
+    pub fn new(rig: Rig, seed: u64) -> Result<BoardScene> {
+        super::check_size(rig.camera.width_px, rig.camera.height_px)?;
+        Ok(BoardScene {
+            rig,
+            columns: 9,
+            rows: 6,
+            square_mm: 25.0,
+            albedo: (0.85, 0.05),
+            ambient: 0.55,
+            laser_power: 0.7,
+            line_sigma_mm: 0.8,
+            blur_px: 0.6,
+            noise: Some(SensorNoise { read: 0.002, electrons: 9000.0 }),
+            seed,
+        })
+    }
+
+    /// Poses, `camera_from_board`, that show the whole board; tilted and spread over image and distance. Two of
+    /// three are under the laser's line.
+    pub fn poses(&self, count: u32) -> Vec<Isometry3<f64>> {
+        (0..count).map(|number| self.pose(number, TILT_DEG)).collect()
+    }
+
+    /// A pose by its number with a greatest tilt, degrees.
+    pub fn pose(&self, number: u32, tilt_deg: f64) -> Isometry3<f64> {
+        let mut random = Stream::at(self.seed, i64::from(number), 0xb0a4d);
+        let camera = &self.rig.camera;
+        loop {
+            let distance_mm = random.between(DISTANCE_MM.0, DISTANCE_MM.1);
+            let mut pixel = RawPixel {
+                u_px: random.between(0.0, f64::from(camera.width_px) - 1.0),
+                v_px: random.between(0.0, f64::from(camera.height_px) - 1.0),
+            };
+            if number % ANYWHERE != 0 {
+                let reach_px = 0.6 * camera.fx_px * self.square_mm / distance_mm * f64::from(self.rows) * 0.5;
+                self.put_on_line(&mut pixel, distance_mm, random.between(-reach_px, reach_px));
+            }
+            let turn = |deg: f64| deg.to_radians();
+            let rotation = Rotation3::from_euler_angles(
+                turn(random.between(-tilt_deg, tilt_deg)),
+                turn(random.between(-tilt_deg, tilt_deg)),
+                turn(random.between(-25.0, 25.0)),
+            );
+            let centre = camera.undistort(pixel).direction() * distance_mm;
+            let middle = self.middle_mm();
+            let rotation = UnitQuaternion::from_rotation_matrix(&rotation);
+            let pose = Isometry3::from_parts((centre - rotation * middle.coords).into(), rotation);
+            if self.shows_whole_board(&pose) {
+                return pose;
+            }
+        }
+    }
+
+    /// Moves a pixel to the laser's line as it lies at a distance.
+    fn put_on_line(&self, pixel: &mut RawPixel, distance_mm: f64, off_px: f64) {
+        let (camera, plane) = (&self.rig.camera, &self.rig.laser.plane);
+        let ray = camera.undistort(*pixel);
+        let n = plane.normal;
+        let ray = match self.rig.laser.line {
+            LineDirection::Vertical => {
+                UndistortedRay { x: (plane.offset_mm / distance_mm - n.z - n.y * ray.y) / n.x, y: ray.y }
+            }
+            LineDirection::Horizontal => {
+                UndistortedRay { x: ray.x, y: (plane.offset_mm / distance_mm - n.z - n.x * ray.x) / n.y }
+            }
+        };
+        *pixel = camera.distort(ray);
+        match self.rig.laser.line {
+            LineDirection::Vertical => pixel.u_px += off_px,
+            LineDirection::Horizontal => pixel.v_px += off_px,
+        }
+    }
+
+    fn middle_mm(&self) -> Point3<f64> {
+        let half = |corners: u32| 0.5 * f64::from(corners - 1) * self.square_mm;
+        Point3::new(half(self.columns), half(self.rows), 0.0)
+    }
+
+    /// True where the board with its rim is inside the image.
+    fn shows_whole_board(&self, pose: &Isometry3<f64>) -> bool {
+        let out = 1.0 + RIM_SQUARES;
+        let ends = |corners: u32| [-out * self.square_mm, (f64::from(corners - 1) + out) * self.square_mm];
+        let camera = &self.rig.camera;
+        ends(self.columns).iter().all(|x| {
+            ends(self.rows).iter().all(|y| {
+                let point = pose * Point3::new(*x, *y, 0.0);
+                let pixel = camera.project(&point);
+                point.z > 100.0
+                    && (0.0..f64::from(camera.width_px)).contains(&pixel.u_px)
+                    && (0.0..f64::from(camera.height_px)).contains(&pixel.v_px)
+            })
+        })
+    }
+
+    /// The photo of a board at a pose; `number` makes its noise.
+    pub fn render(&self, camera_from_board: &Isometry3<f64>, laser_on: bool, number: u32) -> Image {
+        let camera = &self.rig.camera;
+        let (width, height) = (camera.width_px as usize, camera.height_px as usize);
+        let rays = CornerRays::new(&self.rig);
+        let shade = Shade::new(self, camera_from_board, laser_on);
+        let mut pixels = vec![Pixel { rgb: [0.0; 3], from_plane_mm: f32::NAN }; width * height];
+        for_bands(&mut pixels, width, 8, |first_row, rows| {
+            for (i, pixel) in rows.iter_mut().enumerate() {
+                let (column, row) = (i % width, first_row + i / width);
+                let mut random = Stream::at(self.seed ^ 0x5a, i64::from(number), (row * width + column) as i64);
+                let mut sum = [0.0; 3];
+                for cell in 0..RAYS * RAYS {
+                    let inside = |k: usize, r: f64| (k as f64 + r) / RAYS as f64;
+                    let (x, y) = (inside(cell % RAYS, random.unit()), inside(cell / RAYS, random.unit()));
+                    let light = shade.light(rays.at(column, row, x, y));
+                    (0..3).for_each(|c| sum[c] += light[c]);
+                }
+                pixel.rgb = sum.map(|s| (s / (RAYS * RAYS) as f64) as f32);
+            }
+        });
+        blur(&mut pixels, width, self.blur_px);
+        let seed = super::noise::hash(self.seed, i64::from(number), 0x5e);
+        let bgr = Sensor::new(self.noise).expose(&pixels, width, seed);
+        Image::from_bgr(camera.width_px, camera.height_px, bgr)
+    }
+}
+
+/// Directions at the pixels' corners; inside a pixel they are interpolated.
+struct CornerRays {
+    table: Vec<[f64; 2]>,
+    columns: usize,
+}
+
+impl CornerRays {
+    fn new(rig: &Rig) -> CornerRays {
+        let camera = &rig.camera;
+        let columns = camera.width_px as usize + 1;
+        let mut table = vec![[0.0; 2]; columns * (camera.height_px as usize + 1)];
+        for_bands(&mut table, columns, 16, |first_row, rows| {
+            for (i, ray) in rows.iter_mut().enumerate() {
+                let (column, row) = ((i % columns) as f64, (first_row + i / columns) as f64);
+                let found = camera.undistort(RawPixel { u_px: column - 0.5, v_px: row - 0.5 });
+                *ray = [found.x, found.y];
+            }
+        });
+        CornerRays { table, columns }
+    }
+
+    fn at(&self, column: usize, row: usize, x: f64, y: f64) -> Vector3<f64> {
+        let corner = |c: usize, r: usize| self.table[(row + r) * self.columns + column + c];
+        let mix = |k: usize| {
+            let top = corner(0, 0)[k] * (1.0 - x) + corner(1, 0)[k] * x;
+            let bottom = corner(0, 1)[k] * (1.0 - x) + corner(1, 1)[k] * x;
+            top * (1.0 - y) + bottom * y
+        };
+        Vector3::new(mix(0), mix(1), 1.0)
+    }
+}
+
+/// What a photo's light needs.
+struct Shade<'a> {
+    scene: &'a BoardScene,
+    board: Plane,
+    board_from_camera: Isometry3<f64>,
+    laser: Option<[f32; 3]>,
+}
+
+impl<'a> Shade<'a> {
+    fn new(scene: &'a BoardScene, camera_from_board: &Isometry3<f64>, laser_on: bool) -> Shade<'a> {
+        let normal = camera_from_board.rotation * Vector3::z();
+        Shade {
+            scene,
+            board: Plane { normal, offset_mm: normal.dot(&camera_from_board.translation.vector) },
+            board_from_camera: camera_from_board.inverse(),
+            laser: laser_on.then(|| laser_rgb(scene.rig.laser.colour)),
+        }
+    }
+
+    /// Linear red, green, blue along a ray.
+    fn light(&self, ray: Vector3<f64>) -> [f64; 3] {
+        let (point, albedo) = self.surface(ray);
+        // The room is a bit brighter on one side.
+        let room = self.scene.ambient * (1.0 + 0.15 * ray.x + 0.1 * ray.y);
+        let mut light = [room * 1.02, room, room * 0.95];
+        if let Some(colour) = self.laser {
+            let plane = &self.scene.rig.laser.plane;
+            let across = (plane.normal.dot(&point) - plane.offset_mm) / self.scene.line_sigma_mm;
+            let signal = self.scene.laser_power * (600.0 / point.z) * (-0.5 * across * across).exp();
+            (0..3).for_each(|c| light[c] += signal * f64::from(colour[c]));
+        }
+        light.map(|l| l * albedo)
+    }
+
+    /// The place that a ray meets and the share of light that it gives back: the board, or the wall behind.
+    fn surface(&self, ray: Vector3<f64>) -> (Vector3<f64>, f64) {
+        let (white, black) = self.scene.albedo;
+        let depth = self.board.offset_mm / self.board.normal.dot(&ray);
+        if depth > 0.0 {
+            let point = ray * depth;
+            let place = self.board_from_camera * Point3::from(point);
+            let (u, v) = (place.x / self.scene.square_mm, place.y / self.scene.square_mm);
+            let (columns, rows) = (f64::from(self.scene.columns), f64::from(self.scene.rows));
+            let within = |rim: f64| u > -1.0 - rim && u < columns + rim && v > -1.0 - rim && v < rows + rim;
+            if within(0.0) {
+                let even = (u.floor() + v.floor()).rem_euclid(2.0) < 0.5;
+                return (point, if even { black } else { white });
+            }
+            if within(RIM_SQUARES) {
+                return (point, white);
+            }
+        }
+        let point = ray * WALL_MM;
+        let texture = f64::from(value_noise(self.scene.seed, point.x / 15.0, point.y / 15.0));
+        (point, 0.3 + 0.15 * texture)
+    }
+}
+
+/// A Gaussian blur in linear light, rows then columns.
+fn blur(pixels: &mut [Pixel], width: usize, sigma_px: f64) {
+    if sigma_px <= 0.0 {
+        return;
+    }
+    let reach = (4.0 * sigma_px).ceil() as usize;
+    let kernel: Vec<f64> =
+        (0..=2 * reach).map(|i| (-0.5 * ((i as f64 - reach as f64) / sigma_px).powi(2)).exp()).collect();
+    let sum: f64 = kernel.iter().sum();
+    let height = pixels.len() / width;
+    for (step, count, lines, stride) in [(1, width, height, width), (width, height, width, 1)] {
+        for line in 0..lines {
+            let start = line * stride;
+            let values: Vec<[f32; 3]> = (0..count).map(|i| pixels[start + i * step].rgb).collect();
+            for i in 0..count {
+                let mut mixed = [0.0; 3];
+                for (k, weight) in kernel.iter().enumerate() {
+                    let from = (i + k).saturating_sub(reach).min(count - 1);
+                    (0..3).for_each(|c| mixed[c] += weight / sum * f64::from(values[from][c]));
+                }
+                pixels[start + i * step].rgb = mixed.map(|m| m as f32);
+            }
+        }
+    }
+}
+
+/// Writes `count` photos, `board_00.png` and so on, and the true `rig.toml` into a new or empty folder. With
+/// `laser_on` every photo has the line; `progress` hears how many are done.
+///
+/// # Errors
+/// A folder with files in it; what the disk or `progress` says.
+pub fn write_board_photos(
+    scene: &BoardScene,
+    out_dir: &Path,
+    count: u32,
+    mut progress: impl FnMut(u32) -> Result<()>,
+) -> Result<()> {
+    let parent = check_new(out_dir)?;
+    let work = tempfile::Builder::new().prefix(".simulate-").tempdir_in(&parent).map_err(|e| Error::io(&parent, e))?;
+    let rig_path = work.path().join("rig.toml");
+    fs::write(&rig_path, scene.rig.to_toml()).map_err(|e| Error::io(&rig_path, e))?;
+    for (number, pose) in (0..).zip(scene.poses(count)) {
+        let image = scene.render(&pose, true, number);
+        write_png(&work.path().join(format!("board_{number:02}.png")), &image)?;
+        progress(number + 1)?;
+    }
+    super::write::put_in_place(work, out_dir)
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::synthetic::Scene;
+
+    #[test]
+    fn the_line_lies_where_the_plane_meets_the_board() {
+        let rig = Scene::named("lens").expect("a scene").rig(640, 360);
+        let mut scene = BoardScene::new(rig, 3).expect("a scene");
+        (scene.noise, scene.albedo) = (None, (0.8, 0.8));
+        let pose = scene.pose(1, 20.0);
+        let (on, off) = (scene.render(&pose, true, 1), scene.render(&pose, false, 1));
+        // The board's middle row: the brightest green is where the laser's plane is.
+        let middle = scene.rig.camera.project(&(pose * scene.middle_mm()));
+        let row = middle.v_px.round() as usize;
+        let gain =
+            |c: usize| i32::from(on.bgr()[3 * (row * 640 + c) + 1]) - i32::from(off.bgr()[3 * (row * 640 + c) + 1]);
+        let brightest = (0..640).max_by_key(|c| gain(*c)).expect("a row");
+        let ray = scene.rig.camera.undistort(RawPixel { u_px: brightest as f64, v_px: row as f64 });
+        let shade = Shade::new(&scene, &pose, true);
+        let point = shade.surface(ray.direction()).0;
+        let off_mm = scene.rig.laser.plane.normal.dot(&point) - scene.rig.laser.plane.offset_mm;
+        assert!(off_mm.abs() < 2.0, "{off_mm} mm");
+    }
+
+    #[test]
+    fn folders_with_files_are_refused() {
+        let folder = tempfile::tempdir().expect("a temporary folder");
+        fs::write(folder.path().join("a"), "b").expect("write");
+        let scene = BoardScene::new(Scene::named("wall").expect("a scene").rig(320, 240), 1).expect("a board");
+        assert!(write_board_photos(&scene, folder.path(), 1, |_| Ok(())).is_err());
+    }
+}
