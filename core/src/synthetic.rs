@@ -30,7 +30,7 @@ pub use motion::Motion;
 pub use scene::{Ambient, LaserLight, LineProfile, Material, SCENES, Scene, SensorNoise, TextureReach};
 pub use truth::FrameTruth;
 pub use wall::{Bump, Bumps, Shape, StepRow, Wall};
-pub use write::{Output, write_run};
+pub use write::{Output, write_png, write_run};
 
 use nalgebra::Vector3;
 

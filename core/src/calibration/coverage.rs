@@ -18,6 +18,7 @@ const INK: Rgb = [31, 36, 48];
 const PALE: Rgb = [98, 106, 120];
 const RIM: Rgb = [120, 127, 140];
 const PAPER: Rgb = [247, 248, 250];
+const BOARD: Rgb = [205, 209, 215];
 const LASER: Rgb = [22, 163, 74];
 const BAD: Rgb = [190, 24, 60];
 /// Residuals from good to bad: blue, yellow, red; all of them differ in lightness too.
@@ -31,11 +32,11 @@ const ARROW_PX: f64 = 26.0;
 pub(super) fn share(fit: &CameraFit) -> f64 {
     let points: Vec<(f64, f64)> =
         fit.views.iter().flat_map(|v| v.corners.iter().map(|c| (c.pixel.u_px, c.pixel.v_px))).collect();
-    hull_area(points) / (f64::from(fit.camera.width_px) * f64::from(fit.camera.height_px))
+    area(&hull(points)) / (f64::from(fit.camera.width_px) * f64::from(fit.camera.height_px))
 }
 
-/// Area of the convex hull (Andrew's monotone chain).
-fn hull_area(mut points: Vec<(f64, f64)>) -> f64 {
+/// The convex hull (Andrew's monotone chain).
+fn hull(mut points: Vec<(f64, f64)>) -> Vec<(f64, f64)> {
     points.sort_by(|a, b| a.0.total_cmp(&b.0).then(a.1.total_cmp(&b.1)));
     let half = |points: &mut dyn Iterator<Item = (f64, f64)>| {
         let mut chain: Vec<(f64, f64)> = Vec::new();
@@ -51,8 +52,12 @@ fn hull_area(mut points: Vec<(f64, f64)>) -> f64 {
     };
     let mut hull = half(&mut points.iter().copied());
     hull.extend(half(&mut points.iter().rev().copied()));
-    let next = |i: usize| hull[(i + 1) % hull.len()];
-    (0..hull.len()).map(|i| hull[i].0 * next(i).1 - next(i).0 * hull[i].1).sum::<f64>().abs() / 2.0
+    hull
+}
+
+fn area(outline: &[(f64, f64)]) -> f64 {
+    let next = |i: usize| outline[(i + 1) % outline.len()];
+    (0..outline.len()).map(|i| outline[i].0 * next(i).1 - next(i).0 * outline[i].1).sum::<f64>().abs() / 2.0
 }
 
 /// Where the image lies in the picture.
@@ -77,10 +82,11 @@ pub(super) fn write(attempt: &Attempt, path: &Path) -> Result<()> {
     canvas.fill(frame.left as i64, frame.top as i64, w, h, PAPER);
     canvas.outline(frame.left as i64 - 1, frame.top as i64 - 1, w + 2, h + 2, RIM);
     let full_px = full_scale_px(attempt);
+    outlines(&mut canvas, attempt, &frame);
     lines(&mut canvas, attempt, &frame);
     corners(&mut canvas, attempt, &frame, full_px);
     head(&mut canvas, attempt);
-    foot(&mut canvas, full_px, frame.top + h as f64);
+    foot(&mut canvas, full_px, frame.scale, frame.top + h as f64);
     canvas.save_png(path)
 }
 
@@ -91,6 +97,16 @@ fn full_scale_px(attempt: &Attempt) -> f64 {
     off.sort_by(f64::total_cmp);
     let high = off.get((off.len() as f64 * SCALE_SHARE) as usize).copied().unwrap_or(0.1);
     [0.02, 0.05, 0.1, 0.2, 0.5, 1.0, 2.0, 5.0].into_iter().find(|round| *round >= high).unwrap_or(10.0)
+}
+
+/// Each board as far as its corners reach.
+fn outlines(canvas: &mut Canvas, attempt: &Attempt, frame: &Frame) {
+    for photo in &attempt.photos {
+        let outline = hull(photo.corners.iter().map(|(pixel, _)| frame.place(*pixel)).collect());
+        for (i, from) in outline.iter().enumerate() {
+            canvas.line(*from, outline[(i + 1) % outline.len()], 1.0, BOARD);
+        }
+    }
 }
 
 fn lines(canvas: &mut Canvas, attempt: &Attempt, frame: &Frame) {
@@ -158,7 +174,7 @@ fn head(canvas: &mut Canvas, attempt: &Attempt) {
 }
 
 /// The legend.
-fn foot(canvas: &mut Canvas, full_px: f64, bottom: f64) {
+fn foot(canvas: &mut Canvas, full_px: f64, scale: f64, bottom: f64) {
     let (left, top) = (MARGIN_PX as i64, bottom as i64 + 24);
     let base = (top + 18) as f32;
     canvas.text(left as f32, base, "corners: seen, and how far off their place", style(20.0, PALE, Align::Left));
@@ -170,8 +186,7 @@ fn foot(canvas: &mut Canvas, full_px: f64, bottom: f64) {
     canvas.text(bar_left as f32, under, "0", style(18.0, INK, Align::Centre));
     canvas.text((bar_left + 130) as f32, under, &format!("{} px", full_px / 2.0), style(18.0, INK, Align::Centre));
     canvas.text((bar_left + 260) as f32, under, &format!("{full_px} px"), style(18.0, INK, Align::Centre));
-    let arrows =
-        format!("arrows {:.0} times as long as in the image's scale", ARROW_PX / full_px / (FRAME_WIDTH_PX / 1280.0));
+    let arrows = format!("arrows {:.0} times their length", ARROW_PX / full_px / scale);
     canvas.text(left as f32, under, &arrows, style(18.0, PALE, Align::Left));
     let line_left = (bar_left + 340) as f64;
     canvas.line((line_left, top as f64 + 10.0), (line_left + 60.0, top as f64 + 10.0), 2.5, LASER);
@@ -185,7 +200,7 @@ mod tests {
     #[test]
     fn a_hull_has_its_area() {
         let square = vec![(0.0, 0.0), (4.0, 0.0), (4.0, 3.0), (0.0, 3.0), (2.0, 1.0), (0.0, 1.0)];
-        assert!((hull_area(square) - 12.0).abs() < 1e-12);
-        assert_eq!(hull_area(vec![(1.0, 1.0), (2.0, 2.0)]), 0.0);
+        assert!((area(&hull(square)) - 12.0).abs() < 1e-12);
+        assert_eq!(area(&hull(vec![(1.0, 1.0), (2.0, 2.0)])), 0.0);
     }
 }

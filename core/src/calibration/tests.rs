@@ -15,7 +15,7 @@ fn photos(scene: &BoardScene, laser_on: impl Fn(u32) -> bool) -> Vec<Photo> {
         name: format!("{number}.png"),
         image: scene.render(&pose, laser_on(number), number),
     };
-    (0..).zip(scene.poses(15)).map(photo).collect()
+    (0..).zip(scene.poses(15).expect("poses")).map(photo).collect()
 }
 
 fn options(colour: LaserColour) -> Options {

@@ -16,9 +16,9 @@ const MAX_FOCAL_SHARE: f64 = 2e-3;
 /// Largest standard deviation of the centre, share of the image's width.
 const MAX_CENTRE_SHARE: f64 = 2e-3;
 /// Share of the image, by the hull of all corners, below which a lens cannot be known beyond the boards.
-const MIN_COVERAGE: f64 = 0.2;
+const MIN_COVERAGE: f64 = 0.12;
 /// Share below which a warning is due.
-const GOOD_COVERAGE: f64 = 0.5;
+const GOOD_COVERAGE: f64 = 0.25;
 /// Least spread of the laser's points across their main direction, share of their distance.
 const MIN_SPREAD: f64 = 0.02;
 /// Largest standard deviation of the laser plane's direction, degrees, and of its offset, mm.

@@ -30,6 +30,8 @@ const WALL_MM: f64 = 1400.0;
 const DISTANCE_MM: (f64, f64) = (380.0, 850.0);
 /// Largest tilt of a board, degrees.
 const TILT_DEG: f64 = 35.0;
+/// Tries for a pose that shows the whole board; an image of usual shape needs some ten.
+const TRIES: u32 = 10_000;
 /// Every so many-th board is anywhere in the image, the others under the laser's line.
 const ANYWHERE: u32 = 3;
 
@@ -84,15 +86,21 @@ impl BoardScene {
 
     /// Poses, `camera_from_board`, that show the whole board; tilted and spread over image and distance. Two of
     /// three are under the laser's line.
-    pub fn poses(&self, count: u32) -> Vec<Isometry3<f64>> {
+    ///
+    /// # Errors
+    /// As [`BoardScene::pose`].
+    pub fn poses(&self, count: u32) -> Result<Vec<Isometry3<f64>>> {
         (0..count).map(|number| self.pose(number, TILT_DEG)).collect()
     }
 
     /// A pose by its number with a greatest tilt, degrees.
-    pub fn pose(&self, number: u32, tilt_deg: f64) -> Isometry3<f64> {
+    ///
+    /// # Errors
+    /// An image so long and narrow, or a board so large, that it is never seen whole.
+    pub fn pose(&self, number: u32, tilt_deg: f64) -> Result<Isometry3<f64>> {
         let mut random = Stream::at(self.seed, i64::from(number), 0xb0a4d);
         let camera = &self.rig.camera;
-        loop {
+        for _ in 0..TRIES {
             let distance_mm = random.between(DISTANCE_MM.0, DISTANCE_MM.1);
             let mut pixel = RawPixel {
                 u_px: random.between(0.0, f64::from(camera.width_px) - 1.0),
@@ -113,9 +121,14 @@ impl BoardScene {
             let rotation = UnitQuaternion::from_rotation_matrix(&rotation);
             let pose = Isometry3::from_parts((centre - rotation * middle.coords).into(), rotation);
             if self.shows_whole_board(&pose) {
-                return pose;
+                return Ok(pose);
             }
         }
+        Err(Error::input(
+            "size",
+            format!("{}x{} px: the board never fits in", camera.width_px, camera.height_px),
+            "an image of usual shape, such as 1280x720 px",
+        ))
     }
 
     /// Moves a pixel to the laser's line as it lies at a distance.
@@ -318,7 +331,7 @@ pub fn write_board_photos(
     let work = tempfile::Builder::new().prefix(".simulate-").tempdir_in(&parent).map_err(|e| Error::io(&parent, e))?;
     let rig_path = work.path().join("rig.toml");
     fs::write(&rig_path, scene.rig.to_toml()).map_err(|e| Error::io(&rig_path, e))?;
-    for (number, pose) in (0..).zip(scene.poses(count)) {
+    for (number, pose) in (0..).zip(scene.poses(count)?) {
         let image = scene.render(&pose, true, number);
         write_png(&work.path().join(format!("board_{number:02}.png")), &image)?;
         progress(number + 1)?;
@@ -336,7 +349,7 @@ mod tests {
         let rig = Scene::named("lens").expect("a scene").rig(640, 360);
         let mut scene = BoardScene::new(rig, 3).expect("a scene");
         (scene.noise, scene.albedo) = (None, (0.8, 0.8));
-        let pose = scene.pose(1, 20.0);
+        let pose = scene.pose(1, 20.0).expect("a pose");
         let (on, off) = (scene.render(&pose, true, 1), scene.render(&pose, false, 1));
         // The board's middle row: the brightest green is where the laser's plane is.
         let middle = scene.rig.camera.project(&(pose * scene.middle_mm()));
@@ -357,5 +370,12 @@ mod tests {
         fs::write(folder.path().join("a"), "b").expect("write");
         let scene = BoardScene::new(Scene::named("wall").expect("a scene").rig(320, 240), 1).expect("a board");
         assert!(write_board_photos(&scene, folder.path(), 1, |_| Ok(())).is_err());
+    }
+
+    #[test]
+    fn an_image_that_no_board_fits_in_is_refused() {
+        let scene = BoardScene::new(Scene::named("wall").expect("a scene").rig(2000, 32), 1).expect("a board");
+        let message = scene.pose(0, 10.0).expect_err("no room").to_string();
+        assert!(message.contains("2000x32"), "{message}");
     }
 }

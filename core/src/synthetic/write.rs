@@ -149,7 +149,11 @@ fn encode(simulation: &Simulation, folder: &Path, output: Output, images: Receiv
     }
 }
 
-pub(super) fn write_png(path: &Path, image: &Image) -> Result<()> {
+/// Writes one image as PNG.
+///
+/// # Errors
+/// What the disk says.
+pub fn write_png(path: &Path, image: &Image) -> Result<()> {
     let file = fs::File::create(path).map_err(|e| Error::io(path, e))?;
     let mut encoder = png::Encoder::new(std::io::BufWriter::new(file), image.width_px(), image.height_px());
     encoder.set_color(png::ColorType::Rgb);
