@@ -72,8 +72,8 @@ fn hold_the_bars(name: &str, scene: &BoardScene, images: &Path, more: &[&str]) -
     assert!(matches!(done.status.code(), Some(0 | 3)), "{name}: {}", stderr(&done));
     assert!(out.with_extension("coverage.png").exists(), "a picture lies beside the rig");
     let rig = Rig::load(&out).expect("the rig is read back");
-    assert_eq!((rig.name.as_str(), rig.laser.line), (name, scene.rig.laser.line));
-    let (angle_deg, offset_mm, focal) = errors(&rig, &scene.rig);
+    assert_eq!((rig.name.as_str(), rig.laser.line), (name, scene.rig().laser.line));
+    let (angle_deg, offset_mm, focal) = errors(&rig, scene.rig());
     println!("{name}: plane {angle_deg:.4}°, offset {offset_mm:.4} mm, focal length {:.4} %", 100.0 * focal);
     assert!(angle_deg < ANGLE_DEG && offset_mm < OFFSET_MM && focal < FOCAL_SHARE, "{name} holds the bars");
     rig
@@ -241,7 +241,7 @@ fn wrong_usage_says_what_was_expected() {
     for (arguments, word) in [
         (vec!["calibrate", "--out", out], "<IMAGES>"),
         (vec!["calibrate", "x.png", "--board", "9by6", "--square-mm", "25", "--out", out], "9x6"),
-        (vec!["calibrate", "x.png", "--board", "9x6", "--square-mm", "-1", "--out", out], "square-mm"),
+        (vec!["calibrate", "x.png", "--board", "9x6", "--square-mm=-1", "--out", out], "square-mm"),
         (vec!["calibrate", "nowhere.png", "--board", "9x6", "--square-mm", "25", "--out", out], "nowhere.png"),
         (
             vec!["calibrate", "--flat", "a.png=300", "--flat", "b.png=400", "--flat", "c.png=500", "--out", out],

@@ -7,7 +7,8 @@
 //!
 //! Any photo may or may not show the line; one and the same photo serves for both. Corners are measured in the two
 //! colour channels that the laser leaves alone, and those beside the line are not used. A photo of the same board
-//! pose without the laser is subtracted where there is one.
+//! pose without the laser is subtracted where there is one. Once the line is known, the corners that its light
+//! does not reach are measured again in all three channels.
 
 mod board;
 mod camera;
@@ -37,7 +38,7 @@ use plane::{Line3, PlaneFit};
 /// Two photos show one pose where their corners lie so near together, root mean square px.
 const SAME_POSE_PX: f64 = 0.3;
 /// Corners are left out within the line's reach: so many of its standard deviations, and the corner's own window.
-const LINE_SIGMAS: f64 = 3.0;
+const LINE_SIGMAS: f64 = 4.0;
 
 /// What is known beforehand.
 #[derive(Clone, Debug)]
@@ -168,7 +169,7 @@ fn solve(
     // A first camera shows where the laser's lines are; the final one does without the corners beside them.
     let first = camera::fit(&options.board, size_px, views.clone())?;
     let lines = find_lines(photos, options, &first);
-    let clear = views.into_iter().map(|view| without_line(view, &lines, &first)).collect();
+    let clear = views.into_iter().map(|view| without_line(view, photos, &lines, &first)).collect();
     let fit = camera::fit(&options.board, size_px, clear)?;
     let coverage = coverage::share(&fit);
     report_corners(&fit, reports);
@@ -257,13 +258,18 @@ fn same_pose(a: &Posed, b: &Posed) -> bool {
     apart(false) < SAME_POSE_PX || apart(true) < SAME_POSE_PX
 }
 
-/// A view without the corners that the laser's light reaches.
-fn without_line(mut view: View, lines: &[Option<BoardLine>], fit: &CameraFit) -> View {
+/// A view without the corners that the laser's light reaches; the others measured again in all channels.
+fn without_line(mut view: View, photos: &[Photo], lines: &[Option<BoardLine>], fit: &CameraFit) -> View {
     let line = fit.views.iter().position(|v| v.photo == view.photo).and_then(|i| lines.get(i)?.as_ref());
-    if let Some(line) = line {
-        let clear = |c: &Corner| line.distance_px(&fit.camera, c.pixel) > LINE_SIGMAS * line.sigma_px + c.window_px;
-        if view.corners.iter().filter(|c| clear(c)).count() >= camera::MIN_CORNERS {
-            view.corners.retain(clear);
+    let clear = |c: &Corner| {
+        line.is_none_or(|line| line.distance_px(&fit.camera, c.pixel) > LINE_SIGMAS * line.sigma_px + c.window_px)
+    };
+    if view.corners.iter().filter(|c| clear(c)).count() >= camera::MIN_CORNERS {
+        let mut corners = view.corners.clone();
+        corners.retain(clear);
+        board::measure_again(&photos[view.photo].image, &mut corners);
+        if corners.len() >= camera::MIN_CORNERS {
+            view.corners = corners;
         }
     }
     view

@@ -9,7 +9,7 @@ use opencv::core::{Mat, Point2f, Size, Vector};
 use opencv::prelude::*;
 
 use super::corner;
-use super::light::{beside_laser, gray_beside_laser};
+use super::light::{all_light, beside_laser, gray_beside_laser};
 use crate::error::{Error, Result};
 use crate::geometry::RawPixel;
 use crate::rig::LaserColour;
@@ -24,7 +24,7 @@ const SQUARE_MM: (f64, f64) = (0.5, 1000.0);
 /// The window around a corner, as a share of the distance to the nearest other one: it must show one corner only.
 const WINDOW_SHARE: f64 = 0.42;
 /// Least and greatest reach of the window, px: the fit needs pixels, and far ones see bent edges.
-const WINDOW_PX: (f64, f64) = (3.0, 9.0);
+const WINDOW_PX: (f64, f64) = (3.0, 12.0);
 
 /// A checkerboard.
 #[derive(Clone, Copy, Debug, PartialEq)]
@@ -46,6 +46,8 @@ pub struct Corner {
     pub pixel: RawPixel,
     /// How far around it the pixels count, px.
     pub window_px: f64,
+    /// Directions of the two edges that cross there, radians.
+    edges_rad: [f64; 2],
 }
 
 impl Board {
@@ -106,10 +108,23 @@ pub(super) fn find(image: &Image, board: &Board, colour: LaserColour) -> Result<
         let edges_rad = [side.1.atan2(side.0), down.1.atan2(down.0)];
         if let Some(fitted) = corner::refine(&light, *x, *y, edges_rad, window_px) {
             let pixel = RawPixel { u_px: fitted.x_px, v_px: fitted.y_px };
-            corners.push(Corner { index, pixel, window_px });
+            corners.push(Corner { index, pixel, window_px, edges_rad });
         }
     }
     Ok(Some(corners))
+}
+
+/// Corners that the laser's light does not reach, measured again in all three channels.
+pub(super) fn measure_again(image: &Image, corners: &mut Vec<Corner>) {
+    let light = all_light(image);
+    corners.retain_mut(|corner| {
+        let (x_px, y_px) = (corner.pixel.u_px, corner.pixel.v_px);
+        let fitted = corner::refine(&light, x_px, y_px, corner.edges_rad, corner.window_px);
+        if let Some(fitted) = fitted {
+            corner.pixel = RawPixel { u_px: fitted.x_px, v_px: fitted.y_px };
+        }
+        fitted.is_some()
+    });
 }
 
 /// The corners beside a corner, along the rows and columns.

@@ -59,7 +59,15 @@ pub(super) fn beside_laser(image: &Image, colour: LaserColour) -> Plane {
     Plane { width_px: image.width_px() as usize, height_px: image.height_px() as usize, data }
 }
 
-/// The same as stored, 8 bits: what a detector of boards wants.
+/// The mean of all three channels, in linear light: less noise, where there is no laser light.
+pub(super) fn all_light(image: &Image) -> Plane {
+    let table = linear_table();
+    let value = |p: &[u8]| p.iter().map(|v| table[usize::from(*v)]).sum::<f32>() / 3.0;
+    let data = image.bgr().chunks_exact(3).map(value).collect();
+    Plane { width_px: image.width_px() as usize, height_px: image.height_px() as usize, data }
+}
+
+/// The two channels' mean as stored, 8 bits: what a detector of boards wants.
 pub(super) fn gray_beside_laser(image: &Image, colour: LaserColour) -> Vec<u8> {
     let (_, others) = channels(colour);
     let mean = |p: &[u8]| (u16::from(p[others[0]]) + u16::from(p[others[1]])).div_ceil(2) as u8;

@@ -5,6 +5,7 @@
 
 use std::fs;
 use std::path::Path;
+use std::sync::Arc;
 
 use nalgebra::{Isometry3, Point3, Rotation3, UnitQuaternion, Vector3};
 
@@ -38,8 +39,8 @@ const ANYWHERE: u32 = 3;
 /// A board, a rig and the light for photos.
 #[derive(Clone, Debug)]
 pub struct BoardScene {
-    /// The rig that takes the photos.
-    pub rig: Rig,
+    rig: Rig,
+    rays: Arc<CornerRays>,
     /// Inner corners a row.
     pub columns: u32,
     /// Inner corners a column.
@@ -70,6 +71,7 @@ impl BoardScene {
     pub fn new(rig: Rig, seed: u64) -> Result<BoardScene> {
         super::check_size(rig.camera.width_px, rig.camera.height_px)?;
         Ok(BoardScene {
+            rays: Arc::new(CornerRays::new(&rig)),
             rig,
             columns: 9,
             rows: 6,
@@ -82,6 +84,11 @@ impl BoardScene {
             noise: Some(SensorNoise { read: 0.002, electrons: 9000.0 }),
             seed,
         })
+    }
+
+    /// The rig that takes the photos.
+    pub fn rig(&self) -> &Rig {
+        &self.rig
     }
 
     /// Poses, `camera_from_board`, that show the whole board; tilted and spread over image and distance. Two of
@@ -172,22 +179,42 @@ impl BoardScene {
         })
     }
 
+    /// The pixels around the board with its rim.
+    fn outline(&self, pose: &Isometry3<f64>) -> Outline {
+        let out = 1.0 + RIM_SQUARES;
+        let (width, height) = (f64::from(self.columns - 1) + 2.0 * out, f64::from(self.rows - 1) + 2.0 * out);
+        let mut outline = Outline { low: (f64::MAX, f64::MAX), high: (f64::MIN, f64::MIN) };
+        for i in 0..=OUTLINE_STEPS {
+            let t = f64::from(i) / f64::from(OUTLINE_STEPS);
+            for (x, y) in [(t, 0.0), (t, 1.0), (0.0, t), (1.0, t)] {
+                let place = Point3::new(x * width - out, y * height - out, 0.0) * self.square_mm;
+                outline.include(self.rig.camera.project(&(pose * place)));
+            }
+        }
+        outline
+    }
+
     /// The photo of a board at a pose; `number` makes its noise.
     pub fn render(&self, camera_from_board: &Isometry3<f64>, laser_on: bool, number: u32) -> Image {
         let camera = &self.rig.camera;
         let (width, height) = (camera.width_px as usize, camera.height_px as usize);
-        let rays = CornerRays::new(&self.rig);
+        let outline = self.outline(camera_from_board);
         let shade = Shade::new(self, camera_from_board, laser_on);
         let mut pixels = vec![Pixel { rgb: [0.0; 3], from_plane_mm: f32::NAN }; width * height];
         for_bands(&mut pixels, width, 8, |first_row, rows| {
             for (i, pixel) in rows.iter_mut().enumerate() {
                 let (column, row) = (i % width, first_row + i / width);
                 let mut random = Stream::at(self.seed ^ 0x5a, i64::from(number), (row * width + column) as i64);
+                if !outline.holds(column, row) {
+                    // The wall is smooth: one ray says it all.
+                    pixel.rgb = shade.light(self.rays.at(column, row, 0.5, 0.5)).map(|l| l as f32);
+                    continue;
+                }
                 let mut sum = [0.0; 3];
                 for cell in 0..RAYS * RAYS {
                     let inside = |k: usize, r: f64| (k as f64 + r) / RAYS as f64;
                     let (x, y) = (inside(cell % RAYS, random.unit()), inside(cell / RAYS, random.unit()));
-                    let light = shade.light(rays.at(column, row, x, y));
+                    let light = shade.light(self.rays.at(column, row, x, y));
                     (0..3).for_each(|c| sum[c] += light[c]);
                 }
                 pixel.rgb = sum.map(|s| (s / (RAYS * RAYS) as f64) as f32);
@@ -200,7 +227,30 @@ impl BoardScene {
     }
 }
 
+/// Places on each side of the board that its outline is drawn through.
+const OUTLINE_STEPS: u32 = 20;
+
+/// A box of pixels, with a margin for the bow of the sides between the places.
+struct Outline {
+    low: (f64, f64),
+    high: (f64, f64),
+}
+
+impl Outline {
+    fn include(&mut self, pixel: RawPixel) {
+        const MARGIN_PX: f64 = 3.0;
+        self.low = (self.low.0.min(pixel.u_px - MARGIN_PX), self.low.1.min(pixel.v_px - MARGIN_PX));
+        self.high = (self.high.0.max(pixel.u_px + MARGIN_PX), self.high.1.max(pixel.v_px + MARGIN_PX));
+    }
+
+    fn holds(&self, column: usize, row: usize) -> bool {
+        let (x, y) = (column as f64, row as f64);
+        x >= self.low.0 && x <= self.high.0 && y >= self.low.1 && y <= self.high.1
+    }
+}
+
 /// Directions at the pixels' corners; inside a pixel they are interpolated.
+#[derive(Debug)]
 struct CornerRays {
     table: Vec<[f64; 2]>,
     columns: usize,
