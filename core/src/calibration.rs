@@ -2,7 +2,7 @@
 //!
 //! ```text
 //! photos ▶ board ▶ corners ▶ camera, lens, poses ─┐
-//!    └───▶ line on the board's white squares ─────┴▶ points ▶ laser plane ▶ trust ▶ Rig
+//!    └───▶ line on the board's squares ───────────┴▶ points ▶ laser plane ▶ trust ▶ Rig
 //! ```
 //!
 //! Any photo may or may not show the line; one and the same photo serves for both. Corners are measured in the two
@@ -225,8 +225,7 @@ fn find_lines(photos: &[Photo], options: &Options, fit: &CameraFit) -> Vec<Optio
     let look = |view: &Posed, without: Option<&Posed>, direction: LineDirection| {
         let image = &photos[view.photo].image;
         let evidence = light::evidence(image, options.colour, without.map(|w| &photos[w.photo].image));
-        let light = light::beside_laser(image, options.colour);
-        line::find(&evidence, &light, &fit.camera, &options.board, &view.camera_from_board, direction)
+        line::find(&evidence, &fit.camera, &options.board, &view.camera_from_board, direction)
     };
     let found = directions.iter().map(|direction| {
         let lines: Vec<_> = fit.views.iter().map(|view| look(view, None, *direction)).collect();
@@ -308,7 +307,7 @@ fn fit_plane(
             "the photos",
             format!("the laser's line is seen on the board in {} of {}", points.len(), fit.views.len()),
             format!(
-                "at least {}, better 8 or more, photos with the laser on and its line across the board's white squares, at different distances (--laser says its colour)",
+                "at least {}, better 8 or more, photos with the laser on and its line across the board, at different distances (--laser says its colour)",
                 plane::MIN_LINES
             ),
         ));

@@ -190,7 +190,7 @@ fn foot(canvas: &mut Canvas, full_px: f64, scale: f64, bottom: f64) {
     canvas.text(left as f32, under, &arrows, style(18.0, PALE, Align::Left));
     let line_left = (bar_left + 340) as f64;
     canvas.line((line_left, top as f64 + 10.0), (line_left + 60.0, top as f64 + 10.0), 2.5, LASER);
-    canvas.text(line_left as f32 + 74.0, base, "the laser's line on white squares", style(20.0, PALE, Align::Left));
+    canvas.text(line_left as f32 + 74.0, base, "the laser's line on the boards", style(20.0, PALE, Align::Left));
 }
 
 #[cfg(test)]

@@ -28,6 +28,8 @@ const DIFFERENT: f64 = 0.02;
 const MAX_FRAMES: u32 = 100;
 /// Fewest rows with the line, as a share of the image's.
 const MIN_ROWS_SHARE: f64 = 0.25;
+/// No row's spot is surer than this, px: the wall's grain moves them all.
+const SURE_PX: f64 = 0.1;
 /// Largest distance of a wall's line from the fit, px in an image 1280 px wide.
 const MAX_OFF_PX: f64 = 2.0;
 /// Largest difference between a wall's slope of the line and the common one, px over half the image's height.
@@ -209,7 +211,7 @@ fn find_line(
         LineDirection::Vertical => (picture.height_px, picture.width_px),
         LineDirection::Horizontal => (picture.width_px, picture.height_px),
     };
-    let mut rays = Vec::new();
+    let (mut rays, mut weights) = (Vec::new(), Vec::new());
     for along in 0..positions as i64 {
         let value = |at: i64| match direction {
             LineDirection::Vertical => picture.at(at, along),
@@ -218,9 +220,10 @@ fn find_line(
         let row: Option<Vec<f32>> = (0..across as i64).map(value).collect();
         if let Some(spot) = row.and_then(|row| spot::find(&row)) {
             rays.push(camera.undistort(spot.moved(along as f64, 0.0).pixel(direction)));
+            weights.push(spot.deviation_px.max(SURE_PX).powi(-2));
         }
     }
-    let found = straight::fit(&rays, direction, camera.fx_px);
+    let found = straight::fit(&rays, &weights, direction, camera.fx_px);
     let Some((line, inliers)) = found.filter(|(_, i)| i.len() as f64 >= MIN_ROWS_SHARE * positions as f64) else {
         return Err(Error::input(
             name,

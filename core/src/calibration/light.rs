@@ -36,13 +36,17 @@ fn channels(colour: LaserColour) -> (usize, [usize; 2]) {
     }
 }
 
+/// A stored value from here on is clipped: noise and JPEG spread the sensor's full scale a little.
+const CLIPPED: u8 = 252;
+
 /// The laser's channel above the mean of the other two, in linear light; less the same of a photo without the
-/// laser, where there is one.
+/// laser, where there is one. NaN where the laser's channel is clipped: there the light is not known.
 pub(super) fn evidence(image: &Image, colour: LaserColour, without_laser: Option<&Image>) -> Plane {
     let (table, (own, others)) = (linear_table(), channels(colour));
     let value = |p: &[u8]| {
         let linear = |channel: usize| table[usize::from(p[channel])];
-        linear(own) - 0.5 * (linear(others[0]) + linear(others[1]))
+        let above = linear(own) - 0.5 * (linear(others[0]) + linear(others[1]));
+        if p[own] >= CLIPPED { f32::NAN } else { above }
     };
     let mut data: Vec<f32> = image.bgr().chunks_exact(3).map(value).collect();
     if let Some(dark) = without_laser {
@@ -80,12 +84,13 @@ mod tests {
 
     #[test]
     fn gray_is_no_evidence_and_the_lasers_colour_is() {
-        let image = Image::from_bgr(3, 1, vec![128, 128, 128, 10, 250, 10, 250, 10, 10]);
+        let image = Image::from_bgr(4, 1, vec![128, 128, 128, 10, 250, 10, 250, 10, 10, 90, 255, 90]);
         let green = evidence(&image, LaserColour::Green, None);
         assert!(green.data[0].abs() < 1e-6 && green.data[1] > 0.9 && green.data[2] < 0.0);
-        assert!(evidence(&image, LaserColour::Green, Some(&image)).data.iter().all(|v| *v == 0.0));
-        assert_eq!(gray_beside_laser(&image, LaserColour::Green), [128, 10, 130]);
+        assert!(green.data[3].is_nan(), "clipped light is not known");
+        assert!(evidence(&image, LaserColour::Green, Some(&image)).data[..3].iter().all(|v| *v == 0.0));
+        assert_eq!(gray_beside_laser(&image, LaserColour::Green), [128, 10, 130, 90]);
         assert_eq!(green.at(1, 0), Some(green.data[1]));
-        assert_eq!((green.at(3, 0), green.at(0, -1)), (None, None));
+        assert_eq!((green.at(4, 0), green.at(0, -1)), (None, None));
     }
 }

@@ -1,4 +1,4 @@
-//! The laser's line on a board of known pose: sub-pixel spots on its white squares, and the straight line that
+//! The laser's line on a board of known pose: sub-pixel spots inside its squares, and the straight line that
 //! they must form, since the board is flat.
 
 use nalgebra::{Isometry3, Point3};
@@ -10,13 +10,14 @@ use super::straight::{self, Straight};
 use crate::geometry::RawPixel;
 use crate::rig::{Camera, LineDirection};
 
-/// Stay this far inside a square, px: nearer, the blur of the black neighbour pulls the spot.
+/// Stay this far inside a square, px: nearer, the blur of the neighbour of the other colour pulls the spot.
 const MARGIN_PX: f64 = 2.5;
 /// Squares with less inside than this on a side are not used, px.
 const MIN_INSIDE_PX: f64 = 7.0;
-/// A spot must be this far from the ends of its row, standard deviations of the light: cut nearer to its peak, a
-/// clipped core would pull it.
-const MIN_ROOM_SIGMAS: f64 = 2.0;
+/// A spot must be this far from the ends of its row, standard deviations of the light: both flanks must be seen.
+const MIN_ROOM_SIGMAS: f64 = 1.5;
+/// No spot is surer than this, px: the paper's grain moves them all.
+const SURE_PX: f64 = 0.03;
 /// Fewest spots of a line.
 pub(super) const MIN_SPOTS: usize = 15;
 /// Widths that belong to one line, as ratios to the median.
@@ -45,19 +46,23 @@ impl BoardLine {
     }
 }
 
-/// Finds the line on the board; `None` where there is none. `evidence` is the laser's colour, `light` the rest.
+/// Finds the line on the board; `None` where there is none. `evidence` is the laser's light.
+///
+/// White squares show it best, unless it is clipped there; then the black ones do.
 pub(super) fn find(
     evidence: &Plane,
-    light: &Plane,
     camera: &Camera,
     board: &Board,
     camera_from_board: &Isometry3<f64>,
     direction: LineDirection,
 ) -> Option<BoardLine> {
-    let squares = white_squares(light, camera, board, camera_from_board);
     let mut spots: Vec<(Spot, (f64, f64))> = Vec::new();
-    for square in &squares {
-        spots_inside(evidence, square, direction, &mut spots);
+    for row in -1..board.rows as i64 {
+        for column in -1..board.columns as i64 {
+            if let Some(square) = inside_of_square(camera, board, camera_from_board, column, row) {
+                spots_inside(evidence, &square, direction, &mut spots);
+            }
+        }
     }
     if spots.len() < MIN_SPOTS {
         return None;
@@ -72,7 +77,8 @@ pub(super) fn find(
     });
     let pixels: Vec<RawPixel> = spots.iter().map(|(s, _)| s.pixel(direction)).collect();
     let rays: Vec<_> = pixels.iter().map(|p| camera.undistort(*p)).collect();
-    let (line, inliers) = straight::fit(&rays, direction, camera.fx_px)?;
+    let weights: Vec<f64> = spots.iter().map(|(s, _)| s.deviation_px.max(SURE_PX).powi(-2)).collect();
+    let (line, inliers) = straight::fit(&rays, &weights, direction, camera.fx_px)?;
     let spots: Vec<RawPixel> = inliers.iter().map(|i| pixels[*i]).collect();
     let sum: f64 = inliers.iter().map(|i| (line.distance(rays[*i]) * camera.fx_px).powi(2)).sum();
     let rms_px = (sum / inliers.len().max(1) as f64).sqrt();
@@ -101,24 +107,7 @@ pub(super) fn board_plane(camera_from_board: &Isometry3<f64>) -> crate::geometry
 /// A square's inside in the image: its four corners in turn, px.
 type Quad = [(f64, f64); 4];
 
-/// The white squares that are seen whole, those at the board's rim too. Which ones are white is seen in the photo.
-fn white_squares(light: &Plane, camera: &Camera, board: &Board, camera_from_board: &Isometry3<f64>) -> Vec<Quad> {
-    let mut kinds: [(Vec<Quad>, f64, f64); 2] = Default::default();
-    for row in -1..board.rows as i64 {
-        for column in -1..board.columns as i64 {
-            let Some(quad) = inside_of_square(camera, board, camera_from_board, column, row) else { continue };
-            let (x, y) = quad.iter().fold((0.0, 0.0), |sum, p| (sum.0 + p.0 / 4.0, sum.1 + p.1 / 4.0));
-            let Some(level) = light.at(x.round() as i64, y.round() as i64) else { continue };
-            let kind = &mut kinds[(row + column).rem_euclid(2) as usize];
-            kind.0.push(quad);
-            kind.1 += f64::from(level);
-            kind.2 += 1.0;
-        }
-    }
-    let [even, odd] = kinds;
-    if even.1 / even.2.max(1.0) > odd.1 / odd.2.max(1.0) { even.0 } else { odd.0 }
-}
-
+/// The inside of a square that is seen whole; those at the board's rim have numbers from −1.
 fn inside_of_square(
     camera: &Camera,
     board: &Board,

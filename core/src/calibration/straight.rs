@@ -17,6 +17,9 @@ const NEAR_FLOOR_PX: f64 = 0.1;
 /// Share of the spots that must lie on the line.
 const MIN_SHARE: f64 = 0.5;
 
+/// Along, across, weight.
+type Point = (f64, f64, f64);
+
 /// A line x = offset + slope · y in undistorted coordinates (x and y exchanged for a horizontal line).
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub(super) struct Straight {
@@ -37,15 +40,15 @@ impl Straight {
         (self.offset, self.slope)
     }
 
-    /// Least squares.
-    fn through(direction: LineDirection, points: impl Iterator<Item = (f64, f64)> + Clone) -> Option<Straight> {
-        let count = points.clone().count() as f64;
-        let (sum_a, sum_c) = points.clone().fold((0.0, 0.0), |s, p| (s.0 + p.0, s.1 + p.1));
-        let (mean_a, mean_c) = (sum_a / count, sum_c / count);
+    /// Weighted least squares through points (along, across, weight).
+    fn through(direction: LineDirection, points: impl Iterator<Item = Point> + Clone) -> Option<Straight> {
+        let sum = |of: fn(&Point) -> f64| points.clone().map(|p| p.2 * of(&p)).sum::<f64>();
+        let total = sum(|_| 1.0);
+        let (mean_a, mean_c) = (sum(|p| p.0) / total, sum(|p| p.1) / total);
         let (mut square, mut product) = (0.0, 0.0);
-        for (along, across) in points {
-            square += (along - mean_a).powi(2);
-            product += (along - mean_a) * (across - mean_c);
+        for (along, across, weight) in points {
+            square += weight * (along - mean_a).powi(2);
+            product += weight * (along - mean_a) * (across - mean_c);
         }
         let slope = product / square;
         slope.is_finite().then_some(Straight { direction, offset: mean_c - slope * mean_a, slope })
@@ -59,9 +62,18 @@ fn along_across(direction: LineDirection, ray: UndistortedRay) -> (f64, f64) {
     }
 }
 
-/// The line and the spots on it; `None` where fewer than half of them form one.
-pub(super) fn fit(rays: &[UndistortedRay], direction: LineDirection, focal_px: f64) -> Option<(Straight, Vec<usize>)> {
-    let points: Vec<(f64, f64)> = rays.iter().map(|r| along_across(direction, *r)).collect();
+/// The line and the spots on it; `None` where fewer than half of them form one. `weights`: one a spot.
+pub(super) fn fit(
+    rays: &[UndistortedRay],
+    weights: &[f64],
+    direction: LineDirection,
+    focal_px: f64,
+) -> Option<(Straight, Vec<usize>)> {
+    let point = |(ray, weight): (&UndistortedRay, &f64)| {
+        let (along, across) = along_across(direction, *ray);
+        (along, across, *weight)
+    };
+    let points: Vec<Point> = rays.iter().zip(weights).map(point).collect();
     let near = |line: &Straight, limit_px: f64| -> Vec<usize> {
         (0..rays.len()).filter(|i| line.distance(rays[*i]).abs() * focal_px < limit_px).collect()
     };
@@ -103,7 +115,7 @@ mod tests {
                 UndistortedRay { x: across, y: along }
             })
             .collect();
-        let (line, inliers) = fit(&rays, LineDirection::Vertical, 1000.0).expect("a line");
+        let (line, inliers) = fit(&rays, &[1.0; 90], LineDirection::Vertical, 1000.0).expect("a line");
         assert!((line.offset - 0.1).abs() < 1e-9 && (line.slope - 0.05).abs() < 1e-9 && inliers.len() >= 60);
     }
 
@@ -112,7 +124,7 @@ mod tests {
         let cloud: Vec<UndistortedRay> = (0..200)
             .map(|i| UndistortedRay { x: f64::from(i * 37 % 101) / 100.0, y: f64::from(i * 53 % 103) / 100.0 })
             .collect();
-        assert!(fit(&cloud, LineDirection::Vertical, 1000.0).is_none());
-        assert!(fit(&[], LineDirection::Vertical, 1000.0).is_none());
+        assert!(fit(&cloud, &[1.0; 200], LineDirection::Vertical, 1000.0).is_none());
+        assert!(fit(&[], &[], LineDirection::Vertical, 1000.0).is_none());
     }
 }
