@@ -17,6 +17,7 @@ mod coverage;
 mod flat;
 mod light;
 mod line;
+mod lines;
 mod photos;
 mod plane;
 mod spot;
@@ -31,14 +32,9 @@ pub use photos::{Photo, read as read_photos};
 use crate::error::{Error, Result};
 use crate::geometry::RawPixel;
 use crate::rig::{Laser, LaserColour, LineDirection, Rig};
-use camera::{CameraFit, Posed, View};
+use camera::{CameraFit, View};
 use line::BoardLine;
 use plane::{Line3, PlaneFit};
-
-/// Two photos show one pose where their corners lie so near together, root mean square px.
-const SAME_POSE_PX: f64 = 0.3;
-/// Corners are left out within the line's reach: so many of its standard deviations, and the corner's own window.
-const LINE_SIGMAS: f64 = 4.0;
 
 /// What is known beforehand.
 #[derive(Clone, Debug)]
@@ -168,8 +164,8 @@ fn solve(
     }
     // A first camera shows where the laser's lines are; the final one does without the corners beside them.
     let first = camera::fit(&options.board, size_px, views.clone())?;
-    let lines = find_lines(photos, options, &first);
-    let clear = views.into_iter().map(|view| without_line(view, photos, &lines, &first)).collect();
+    let lines = lines::find(photos, options, &first);
+    let clear = views.into_iter().map(|view| lines::without(view, photos, &lines, &first)).collect();
     let fit = camera::fit(&options.board, size_px, clear)?;
     let coverage = coverage::share(&fit);
     report_corners(&fit, reports);
@@ -177,7 +173,7 @@ fn solve(
     let (plane, line) = fit_plane(&fit, &lines, reports)?;
     let (angle_rad, offset_mm) = with_camera(&plane, &fit);
     trust::check_plane(&plane, angle_rad, offset_mm)?;
-    warnings.extend(trust::warnings(&fit, coverage, &plane));
+    warnings.extend(trust::warnings(&fit, coverage, &plane, angle_rad));
     let laser = Laser { colour: options.colour, line, plane: plane.plane };
     let rig = Rig { name: options.name.clone(), camera: fit.camera.clone(), laser };
     // The same checks as when it is loaded: a rig that Stria would refuse is never written.
@@ -214,64 +210,6 @@ fn too_few(photos: &[Photo], options: &Options, found: usize) -> Result<Error> {
     let found =
         format!("a board of {}x{} inner corners was found in {found} of {}", board.columns, board.rows, photos.len());
     Ok(Error::input("the photos", found, expected))
-}
-
-/// The laser's line in each view, in the direction that most of the light agrees with.
-fn find_lines(photos: &[Photo], options: &Options, fit: &CameraFit) -> Vec<Option<BoardLine>> {
-    let directions = match options.line {
-        Some(direction) => vec![direction],
-        None => vec![LineDirection::Vertical, LineDirection::Horizontal],
-    };
-    let look = |view: &Posed, without: Option<&Posed>, direction: LineDirection| {
-        let image = &photos[view.photo].image;
-        let evidence = light::evidence(image, options.colour, without.map(|w| &photos[w.photo].image));
-        line::find(&evidence, &fit.camera, &options.board, &view.camera_from_board, direction)
-    };
-    let found = directions.iter().map(|direction| {
-        let lines: Vec<_> = fit.views.iter().map(|view| look(view, None, *direction)).collect();
-        let spots: usize = lines.iter().flatten().map(|l| l.spots.len()).sum();
-        (spots, *direction, lines)
-    });
-    let Some((_, direction, lines)) = found.max_by_key(|(spots, ..)| *spots) else { return Vec::new() };
-    let dark: Vec<&Posed> = fit.views.iter().zip(&lines).filter(|(_, l)| l.is_none()).map(|(v, _)| v).collect();
-    let views = fit.views.iter().zip(lines);
-    let better = |(view, line): (&Posed, Option<BoardLine>)| {
-        let twin = dark.iter().find(|d| d.photo != view.photo && same_pose(d, view))?;
-        look(view, Some(twin), direction).filter(|_| line.is_some())
-    };
-    views.map(|(view, line)| better((view, line.clone())).or(line)).collect()
-}
-
-/// True where two photos show the board in one place, whichever end the detector began at.
-fn same_pose(a: &Posed, b: &Posed) -> bool {
-    let last = a.corners.iter().chain(&b.corners).map(|c| c.index).max().unwrap_or(0);
-    let apart = |turned: bool| {
-        let pairs = a.corners.iter().filter_map(|one| {
-            let index = if turned { last - one.index } else { one.index };
-            let other = b.corners.iter().find(|c| c.index == index)?;
-            Some((one.pixel.u_px - other.pixel.u_px).powi(2) + (one.pixel.v_px - other.pixel.v_px).powi(2))
-        });
-        let (sum, count) = pairs.fold((0.0, 0.0), |(sum, count), square| (sum + square, count + 1.0));
-        (sum / count).sqrt()
-    };
-    apart(false) < SAME_POSE_PX || apart(true) < SAME_POSE_PX
-}
-
-/// A view without the corners that the laser's light reaches; the others measured again in all channels.
-fn without_line(mut view: View, photos: &[Photo], lines: &[Option<BoardLine>], fit: &CameraFit) -> View {
-    let line = fit.views.iter().position(|v| v.photo == view.photo).and_then(|i| lines.get(i)?.as_ref());
-    let clear = |c: &Corner| {
-        line.is_none_or(|line| line.distance_px(&fit.camera, c.pixel) > LINE_SIGMAS * line.sigma_px + c.window_px)
-    };
-    if view.corners.iter().filter(|c| clear(c)).count() >= camera::MIN_CORNERS {
-        let mut corners = view.corners.clone();
-        corners.retain(clear);
-        board::measure_again(&photos[view.photo].image, &mut corners);
-        if corners.len() >= camera::MIN_CORNERS {
-            view.corners = corners;
-        }
-    }
-    view
 }
 
 fn report_corners(fit: &CameraFit, reports: &mut [PhotoReport]) {
@@ -322,10 +260,12 @@ fn fit_plane(
     Ok((plane, direction))
 }
 
-/// The plane's deviations with the camera's share: a centre that is off by a pixel turns everything by 1/f.
+/// The plane's deviations with the camera's share: a centre that is off by a pixel turns everything by 1/f about
+/// the other axis.
 fn with_camera(plane: &PlaneFit, fit: &CameraFit) -> (f64, f64) {
     let (u, v) = fit.deviations.centre_px;
-    let turn_rad = u.hypot(v) / fit.camera.fx_px;
+    let n = plane.plane.normal;
+    let turn_rad = (u * n.x.hypot(n.z)).hypot(v * n.y.hypot(n.z)) / fit.camera.fx_px;
     (plane.angle_rad.hypot(turn_rad), plane.offset_mm)
 }
 

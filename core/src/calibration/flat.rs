@@ -4,17 +4,15 @@
 //! from the image's middle. Two unknowns, so three distances show whether the model holds. The focal length cannot
 //! come from such photos (a longer lens and a longer baseline look the same): it is given.
 
+mod wall;
+
 use std::path::PathBuf;
 
 use nalgebra::{DMatrix, DVector, Vector3};
 
-use super::light::{Plane as Picture, evidence};
-use super::spot;
-use super::straight;
 use crate::error::{Error, Result};
 use crate::geometry::Plane;
 use crate::rig::{Camera, Laser, LaserColour, LineDirection, Rig};
-use crate::source;
 
 /// Distances between camera and wall that are believable, mm.
 const DISTANCE_MM: (f64, f64) = (20.0, 100_000.0);
@@ -24,12 +22,6 @@ const MIN_WALLS: usize = 3;
 const MIN_RATIO: f64 = 1.25;
 /// Distances are different where they differ by this share.
 const DIFFERENT: f64 = 0.02;
-/// Frames of a video that are averaged: more do not help against what remains.
-const MAX_FRAMES: u32 = 100;
-/// Fewest rows with the line, as a share of the image's.
-const MIN_ROWS_SHARE: f64 = 0.25;
-/// No row's spot is surer than this, px: the wall's grain moves them all.
-const SURE_PX: f64 = 0.1;
 /// Largest distance of a wall's line from the fit, px in an image 1280 px wide.
 const MAX_OFF_PX: f64 = 2.0;
 /// Largest difference between a wall's slope of the line and the common one, px over half the image's height.
@@ -121,9 +113,9 @@ pub fn calibrate_flat(
     check_distances(walls)?;
     let (mut fits, mut size_px) = (Vec::new(), None);
     for (number, wall) in walls.iter().enumerate() {
-        let (picture, name) = mean_evidence(wall, options.colour, &mut size_px)?;
+        let (picture, name) = wall::mean_evidence(wall, options.colour, &mut size_px)?;
         let size = (picture.width_px as u32, picture.height_px as u32);
-        fits.push(find_line(&picture, &camera(size, options.view), options.line, name, wall.distance_mm)?);
+        fits.push(wall::find_line(&picture, &camera(size, options.view), options.line, name, wall.distance_mm)?);
         progress(number + 1, walls.len())?;
     }
     solve(fits, &camera(size_px.unwrap_or((0, 0)), options.view), options)
@@ -161,36 +153,6 @@ fn check_distances(walls: &[FlatWall]) -> Result<()> {
     Ok(())
 }
 
-/// The mean of the laser's light over the frames of a source.
-fn mean_evidence(wall: &FlatWall, colour: LaserColour, size_px: &mut Option<(u32, u32)>) -> Result<(Picture, String)> {
-    let name =
-        wall.source.file_name().map_or_else(|| wall.source.display().to_string(), |n| n.to_string_lossy().into());
-    let mut frames = source::open(&wall.source, &name, None)?;
-    let (mut sum, mut count): (Option<Picture>, u32) = (None, 0);
-    while count < MAX_FRAMES
-        && let Some(frame) = frames.next_frame()?
-    {
-        let size = (frame.image.width_px(), frame.image.height_px());
-        let expected = *size_px.get_or_insert(size);
-        if size != expected {
-            let found = format!("{}x{} px", size.0, size.1);
-            let expected = format!("{}x{} px like the other walls: one camera, one setting", expected.0, expected.1);
-            return Err(Error::field(name, "image size", found, expected));
-        }
-        let next = evidence(&frame.image, colour, None);
-        match &mut sum {
-            None => sum = Some(next),
-            Some(sum) => sum.data.iter_mut().zip(next.data).for_each(|(s, v)| *s += v),
-        }
-        count += 1;
-    }
-    let Some(mut mean) = sum else {
-        return Err(Error::input(name, "no picture in it", "a flat wall with the laser on"));
-    };
-    mean.data.iter_mut().for_each(|v| *v /= count as f32);
-    Ok((mean, name))
-}
-
 /// The paper's camera: no lens distortion, the centre in the middle.
 fn camera(size_px: (u32, u32), view: FlatView) -> Camera {
     let fov_rad = match view {
@@ -198,49 +160,6 @@ fn camera(size_px: (u32, u32), view: FlatView) -> Camera {
         FlatView::FocalPx(focal_px) => 2.0 * (f64::from(size_px.0) / (2.0 * focal_px)).atan(),
     };
     Rig::from_paper(size_px.0, size_px.1, fov_rad, 1.0, std::f64::consts::FRAC_PI_2, LaserColour::Green).camera
-}
-
-fn find_line(
-    picture: &Picture,
-    camera: &Camera,
-    direction: LineDirection,
-    name: String,
-    distance_mm: f64,
-) -> Result<WallFit> {
-    let (positions, across) = match direction {
-        LineDirection::Vertical => (picture.height_px, picture.width_px),
-        LineDirection::Horizontal => (picture.width_px, picture.height_px),
-    };
-    let (mut rays, mut weights) = (Vec::new(), Vec::new());
-    for along in 0..positions as i64 {
-        let value = |at: i64| match direction {
-            LineDirection::Vertical => picture.at(at, along),
-            LineDirection::Horizontal => picture.at(along, at),
-        };
-        let row: Option<Vec<f32>> = (0..across as i64).map(value).collect();
-        if let Some(spot) = row.and_then(|row| spot::find(&row)) {
-            rays.push(camera.undistort(spot.moved(along as f64, 0.0).pixel(direction)));
-            weights.push(spot.deviation_px.max(SURE_PX).powi(-2));
-        }
-    }
-    let found = straight::fit(&rays, &weights, direction, camera.fx_px);
-    let Some((line, inliers)) = found.filter(|(_, i)| i.len() as f64 >= MIN_ROWS_SHARE * positions as f64) else {
-        return Err(Error::input(
-            name,
-            format!("a straight laser line in fewer than {:.0} % of the rows", 100.0 * MIN_ROWS_SHARE),
-            "a photo of a flat wall with the laser on and its line clearly visible (--laser says its colour, --line its direction)",
-        ));
-    };
-    let (offset, slope) = line.offset_slope();
-    Ok(WallFit {
-        name,
-        distance_mm,
-        rows: inliers.len(),
-        column_px: offset * camera.fx_px,
-        slope,
-        residual_px: 0.0,
-        residual_mm: 0.0,
-    })
 }
 
 /// Least squares over the walls, then the checks.

@@ -18,6 +18,8 @@ const MIN_INSIDE_PX: f64 = 7.0;
 const MIN_ROOM_SIGMAS: f64 = 1.5;
 /// No spot is surer than this, px: the paper's grain moves them all.
 const SURE_PX: f64 = 0.03;
+/// Spots so many times less sure than the best quarter are not used.
+const UNSURE_RATIO: f64 = 3.0;
 /// Fewest spots of a line.
 pub(super) const MIN_SPOTS: usize = 15;
 /// Widths that belong to one line, as ratios to the median.
@@ -75,6 +77,7 @@ pub(super) fn find(
         let room_px = (spot.across_px - from).min(to - spot.across_px);
         SAME_WIDTH.contains(&(spot.sigma_px / sigma_px)) && room_px > MIN_ROOM_SIGMAS * sigma_px
     });
+    leave_out_unsure(&mut spots);
     let pixels: Vec<RawPixel> = spots.iter().map(|(s, _)| s.pixel(direction)).collect();
     let rays: Vec<_> = pixels.iter().map(|p| camera.undistort(*p)).collect();
     let weights: Vec<f64> = spots.iter().map(|(s, _)| s.deviation_px.max(SURE_PX).powi(-2)).collect();
@@ -85,6 +88,16 @@ pub(super) fn find(
     let long = length_mm(&inliers.iter().map(|i| rays[*i]).collect::<Vec<_>>(), camera_from_board);
     let good = spots.len() >= MIN_SPOTS && long > MIN_LENGTH_SQUARES * board.square_mm;
     good.then_some(BoardLine { direction, spots, straight: line, sigma_px, rms_px })
+}
+
+/// Takes out spots much less sure than the better ones: black squares in weak light add nothing but noise.
+fn leave_out_unsure(spots: &mut Vec<(Spot, (f64, f64))>) {
+    let mut deviations: Vec<f64> = spots.iter().map(|(s, _)| s.deviation_px).collect();
+    let quarter = deviations.len() / 4;
+    if !deviations.is_empty() {
+        let good = deviations.select_nth_unstable_by(quarter, f64::total_cmp).1.max(SURE_PX);
+        spots.retain(|(s, _)| s.deviation_px <= UNSURE_RATIO * good);
+    }
 }
 
 /// How far the spots reach on the board, mm.

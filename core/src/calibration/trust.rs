@@ -12,7 +12,9 @@ const MIN_TILT_DEG: f64 = 10.0;
 /// Largest reprojection error, px in an image 1280 px wide: beyond it the board is not flat, or not that board.
 const MAX_RMS_PX: f64 = 1.0;
 /// Largest standard deviation of the focal length, share of it: depth is as wrong as the focal length.
-const MAX_FOCAL_SHARE: f64 = 2e-3;
+const MAX_FOCAL_SHARE: f64 = 3e-3;
+/// Standard deviation of the focal length from which a warning is due, share of it.
+const GOOD_FOCAL_SHARE: f64 = 1e-3;
 /// Largest standard deviation of the centre, share of the image's width.
 const MAX_CENTRE_SHARE: f64 = 2e-3;
 /// Share of the image, by the hull of all corners, below which a lens cannot be known beyond the boards.
@@ -22,8 +24,10 @@ const GOOD_COVERAGE: f64 = 0.25;
 /// Least spread of the laser's points across their main direction, share of their distance.
 const MIN_SPREAD: f64 = 0.02;
 /// Largest standard deviation of the laser plane's direction, degrees, and of its offset, mm.
-const MAX_PLANE_DEG: f64 = 0.1;
+const MAX_PLANE_DEG: f64 = 0.15;
 const MAX_PLANE_MM: f64 = 0.5;
+/// Standard deviation of its direction from which a warning is due, degrees.
+const GOOD_PLANE_DEG: f64 = 0.05;
 /// Largest distance of the laser's points from the plane, share of their distance.
 const MAX_PLANE_RMS_SHARE: f64 = 2e-3;
 
@@ -56,14 +60,14 @@ pub(super) fn check_camera(fit: &CameraFit, coverage: f64) -> Result<()> {
         );
     }
     let share = fit.deviations.focal_px / camera.fx_px;
-    if !(share <= MAX_FOCAL_SHARE) {
+    if share.is_nan() || share > MAX_FOCAL_SHARE {
         return refuse(
             format!("the focal length is only known to ± {:.2} %", 100.0 * share),
-            "± 0.2 % or better: more photos, nearer, with the board tilted by 15° to 40° in different directions",
+            "± 0.3 % or better: more photos, nearer, with the board tilted by 15° to 40° in different directions",
         );
     }
     let (u, v) = fit.deviations.centre_px;
-    if !(u.max(v) <= MAX_CENTRE_SHARE * width) {
+    if (u + v).is_nan() || u.max(v) > MAX_CENTRE_SHARE * width {
         return refuse(
             format!("the image's centre is only known to ± {:.1} px", u.max(v)),
             "more photos with the board tilted, turned by 90°, and near each corner of the image",
@@ -92,18 +96,31 @@ pub(super) fn check_plane(fit: &PlaneFit, angle_rad: f64, offset_mm: f64) -> Res
         );
     }
     let angle_deg = angle_rad.to_degrees();
-    if !(angle_deg <= MAX_PLANE_DEG && offset_mm <= MAX_PLANE_MM) {
+    if (angle_deg + offset_mm).is_nan() || angle_deg > MAX_PLANE_DEG || offset_mm > MAX_PLANE_MM {
         return refuse(
             format!("the laser plane is only known to ± {angle_deg:.2}° and ± {offset_mm:.2} mm"),
-            "± 0.1° and ± 0.5 mm or better: more photos with the laser's line on the board, at more different distances",
+            "± 0.15° and ± 0.5 mm or better: more photos with the laser's line on the board, at more different distances",
         );
     }
     Ok(())
 }
 
 /// What could be better, in words for people.
-pub(super) fn warnings(camera: &CameraFit, coverage: f64, plane: &PlaneFit) -> Vec<String> {
+pub(super) fn warnings(camera: &CameraFit, coverage: f64, plane: &PlaneFit, angle_rad: f64) -> Vec<String> {
     let mut warnings = Vec::new();
+    let share = camera.deviations.focal_px / camera.camera.fx_px;
+    if share > GOOD_FOCAL_SHARE {
+        warnings.push(format!(
+            "the focal length is known to ± {:.2} %: more photos, nearer and more tilted, make it better",
+            100.0 * share
+        ));
+    }
+    if angle_rad.to_degrees() > GOOD_PLANE_DEG {
+        warnings.push(format!(
+            "the laser plane is known to ± {:.2}°: more photos, near each corner of the image and at more distances, make it better",
+            angle_rad.to_degrees()
+        ));
+    }
     if coverage < GOOD_COVERAGE {
         warnings.push(format!(
             "the boards cover {:.0} % of the image; outside them the lens is a guess: take photos with the board near the image's corners",
