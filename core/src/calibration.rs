@@ -54,7 +54,7 @@ pub struct Options {
 pub struct PhotoReport {
     /// The photo's name.
     pub name: String,
-    /// Corners that were used, and how far each was seen from its place, px.
+    /// Corners that were used, and how far each was seen from its place, px (zero where no camera was fitted).
     pub corners: Vec<(RawPixel, (f64, f64))>,
     /// Root mean square of those distances, px.
     pub rms_px: Option<f64>,
@@ -143,7 +143,10 @@ fn find_boards(
             Some(corners) if corners.len() < camera::MIN_CORNERS => {
                 attempt.photos[number].note = format!("only {} corners are sharp", corners.len());
             }
-            Some(corners) => views.push(View { photo: number, corners }),
+            Some(corners) => {
+                attempt.photos[number].corners = corners.iter().map(|c| (c.pixel, (0.0, 0.0))).collect();
+                views.push(View { photo: number, corners });
+            }
         }
         progress(number + 1, photos.len())?;
     }

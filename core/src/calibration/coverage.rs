@@ -144,7 +144,7 @@ fn style(size_px: f32, colour: Rgb, align: Align) -> Style {
 
 fn head(canvas: &mut Canvas, attempt: &Attempt) {
     let left = MARGIN_PX as f32;
-    let boards = attempt.photos.iter().filter(|p| p.rms_px.is_some()).count();
+    let boards = attempt.photos.iter().filter(|p| !p.corners.is_empty()).count();
     let lines = attempt.photos.iter().filter(|p| !p.spots.is_empty()).count();
     let counts = format!(
         "{} photos   ·   board in {boards}   ·   laser line in {lines}   ·   {} x {} px",
