@@ -5,6 +5,7 @@
 //! maps are read in windows through [`crate::depth_map::MapReader`].
 
 pub mod archive_mcap;
+pub(crate) mod canvas;
 pub mod cloud_ply;
 pub mod depth_png;
 pub mod depth_tif;

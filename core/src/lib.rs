@@ -18,6 +18,7 @@
 //! frame at the run's first frame, turned about z so that x lies along the travel that the rig's laser
 //! line implies: along the image's x for a vertical line, along its y for a horizontal one.
 
+pub mod calibration;
 pub mod depth_map;
 pub mod error;
 pub mod export;

@@ -9,6 +9,7 @@
 //! the seed and its own index only: frames may be rendered in any order, and twice.
 
 mod bands;
+mod board;
 mod decals;
 mod encode;
 mod ground;
@@ -23,12 +24,13 @@ mod truth;
 mod wall;
 mod write;
 
+pub use board::{BoardScene, write_board_photos};
 pub use encode::{Quality, VideoWriter};
 pub use motion::Motion;
 pub use scene::{Ambient, LaserLight, LineProfile, Material, SCENES, Scene, SensorNoise, TextureReach};
 pub use truth::FrameTruth;
 pub use wall::{Bump, Bumps, Shape, StepRow, Wall};
-pub use write::{Output, write_run};
+pub use write::{Output, write_png, write_run};
 
 use nalgebra::Vector3;
 

@@ -1,5 +1,6 @@
 //! The command line: one file per command. A command returns its exit code; errors are said here, once.
 
+mod calibrate;
 mod inspect;
 mod process;
 mod progress;
@@ -24,6 +25,7 @@ struct Cli {
 enum Command {
     Process(process::Process),
     Simulate(simulate::SimulateArgs),
+    Calibrate(calibrate::Calibrate),
     Serve(serve::Serve),
     Send(send::Send),
     Inspect(inspect::Inspect),
@@ -71,6 +73,7 @@ pub fn run() -> ExitCode {
     let outcome = match cli.command {
         Command::Process(command) => command.run(),
         Command::Simulate(args) => simulate::run(&args).map(|()| Success::Done),
+        Command::Calibrate(command) => command.run(),
         Command::Serve(command) => command.run(),
         Command::Send(command) => command.run(),
         Command::Inspect(command) => command.run(),

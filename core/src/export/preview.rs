@@ -4,7 +4,6 @@
 //! The colours span the middle 98 % of the depths, so that a few stray points do not flatten the rest. Long
 //! maps are wrapped into strips, read like lines of text.
 
-mod canvas;
 mod colour;
 mod furniture;
 mod layout;
@@ -13,13 +12,10 @@ mod relief;
 
 use std::path::Path;
 
-use png::{BitDepth, ColorType, Compression, Encoder};
-
 use crate::depth_map::MapReader;
 use crate::error::{Error, Result};
-use crate::export::new_file::NewFile;
+use crate::export::canvas::Canvas;
 
-use canvas::Canvas;
 use layout::{Layout, WIDTH_PX};
 use reduce::Reduced;
 
@@ -57,7 +53,7 @@ struct Range {
 /// # Errors
 /// An empty map; what the reading of the map or the disk says.
 pub fn write(map: &mut dyn MapReader, path: &Path, text: &PreviewText) -> Result<()> {
-    save(&paint(map, text)?, path)
+    paint(map, text)?.save_png(path)
 }
 
 /// The picture in memory: width and height, px, and red, green, blue of each pixel.
@@ -113,19 +109,6 @@ fn draw_map(canvas: &mut Canvas, layout: &Layout, map: &Reduced, range: Option<R
             }
         }
     }
-}
-
-fn save(canvas: &Canvas, path: &Path) -> Result<()> {
-    let refused = |e: png::EncodingError| Error::io(path, e.into());
-    let mut file = NewFile::create(path)?;
-    let mut encoder = Encoder::new(&mut file, canvas.width_px as u32, canvas.height_px as u32);
-    encoder.set_color(ColorType::Rgb);
-    encoder.set_depth(BitDepth::Eight);
-    encoder.set_compression(Compression::Balanced);
-    let mut writer = encoder.write_header().map_err(refused)?;
-    writer.write_image_data(canvas.rgb()).map_err(refused)?;
-    writer.finish().map_err(refused)?;
-    file.commit()
 }
 
 #[cfg(test)]

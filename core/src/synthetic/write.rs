@@ -47,6 +47,11 @@ pub fn write_run(
     fs::write(&rig_path, simulation.rig().to_toml()).map_err(|e| Error::io(&rig_path, e))?;
     write_frames(simulation, work.path(), &truth_dir, output, progress)?;
     write_surface(simulation, &truth_dir)?;
+    put_in_place(work, out_dir)
+}
+
+/// Gives a finished folder its name.
+pub(super) fn put_in_place(work: tempfile::TempDir, out_dir: &Path) -> Result<()> {
     // An empty folder in the way: `rename` replaces it.
     let path = work.keep();
     fs::rename(&path, out_dir).map_err(|e| {
@@ -66,7 +71,7 @@ fn readable_for_others(folder: &Path) -> Result<()> {
     Ok(())
 }
 
-fn check_new(out_dir: &Path) -> Result<PathBuf> {
+pub(super) fn check_new(out_dir: &Path) -> Result<PathBuf> {
     let taken = match fs::read_dir(out_dir) {
         Ok(mut entries) => entries.next().is_some(),
         Err(e) if e.kind() == std::io::ErrorKind::NotFound => false,
@@ -144,7 +149,11 @@ fn encode(simulation: &Simulation, folder: &Path, output: Output, images: Receiv
     }
 }
 
-fn write_png(path: &Path, image: &Image) -> Result<()> {
+/// Writes one image as PNG.
+///
+/// # Errors
+/// What the disk says.
+pub fn write_png(path: &Path, image: &Image) -> Result<()> {
     let file = fs::File::create(path).map_err(|e| Error::io(path, e))?;
     let mut encoder = png::Encoder::new(std::io::BufWriter::new(file), image.width_px(), image.height_px());
     encoder.set_color(png::ColorType::Rgb);

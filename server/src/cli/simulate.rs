@@ -9,14 +9,16 @@ use std::sync::atomic::{AtomicBool, Ordering};
 use clap::{Args, ValueEnum};
 use indicatif::{ProgressBar, ProgressStyle};
 use stria_core::rig::{LaserColour, LineDirection};
-use stria_core::synthetic::{Motion, Output, Quality, SCENES, Scene, Simulation, write_run};
+use stria_core::synthetic::{
+    BoardScene, Motion, Output, Quality, SCENES, Scene, Simulation, write_board_photos, write_run,
+};
 use stria_core::{Error, Result};
 
 use super::Failed;
 use super::process::stop_on_signals;
 
 /// Makes a run with known truth: a video, its rig, its truth
-#[derive(Args, Debug)]
+#[derive(Args, Clone, Debug)]
 #[command(after_help = scene_list())]
 pub(super) struct SimulateArgs {
     /// What to show; the list is below
@@ -53,15 +55,17 @@ pub(super) struct SimulateArgs {
     frames: bool,
 }
 
+/// A laser's colour on the command line.
 #[derive(Clone, Copy, Debug, ValueEnum)]
-enum ColourArg {
+pub(super) enum ColourArg {
     Green,
     Red,
     Blue,
 }
 
+/// The line's direction on the command line.
 #[derive(Clone, Copy, Debug, ValueEnum)]
-enum LineArg {
+pub(super) enum LineArg {
     /// Along the image's columns; the robot moves along its rows
     Vertical,
     /// Along the image's rows; the robot moves along its columns
@@ -80,13 +84,39 @@ enum MotionArg {
     Stop,
 }
 
+impl From<ColourArg> for LaserColour {
+    fn from(colour: ColourArg) -> LaserColour {
+        match colour {
+            ColourArg::Green => LaserColour::Green,
+            ColourArg::Red => LaserColour::Red,
+            ColourArg::Blue => LaserColour::Blue,
+        }
+    }
+}
+
+impl From<LineArg> for LineDirection {
+    fn from(line: LineArg) -> LineDirection {
+        match line {
+            LineArg::Vertical => LineDirection::Vertical,
+            LineArg::Horizontal => LineDirection::Horizontal,
+        }
+    }
+}
+
 fn scene_list() -> String {
     let lines: Vec<String> = SCENES.iter().map(|(name, text)| format!("  {name:<12} {text}")).collect();
     format!(
-        "Scenes:\n{}\n\nDIR gets video.mp4, rig.toml and truth/ (stripes.npy, measurable.npy, trajectory.csv,\nsurface_z_mm.npy, surface.json).",
-        lines.join("\n")
+        "Scenes:\n{}\n  {BOARD:<12} {BOARD_PHOTOS} photos of a 9x6 checkerboard (25 mm), for `stria calibrate`; of the options\n{:15}only --size, --seed, --laser and --line count\n\nDIR gets video.mp4, rig.toml and truth/ (stripes.npy, measurable.npy, trajectory.csv,\nsurface_z_mm.npy, surface.json).",
+        lines.join("\n"),
+        ""
     )
 }
+
+/// The scene that is no run but photos for a calibration.
+const BOARD: &str = "board";
+
+/// How many of them.
+const BOARD_PHOTOS: u32 = 15;
 
 /// Runs the command; the progress goes to the terminal's error stream.
 ///
@@ -96,6 +126,9 @@ fn scene_list() -> String {
 pub(super) fn run(args: &SimulateArgs) -> std::result::Result<(), Failed> {
     let stop = Arc::new(AtomicBool::new(false));
     stop_on_signals(stop.clone())?;
+    if args.scene == BOARD {
+        return board_photos(args, &stop);
+    }
     let simulation = Simulation::new(scene(args)?, parse_size(&args.size)?, args.fps, args.seconds, args.seed)?;
     let output = match (args.frames, args.exact) {
         (true, _) => Output::Images,
@@ -118,20 +151,27 @@ pub(super) fn run(args: &SimulateArgs) -> std::result::Result<(), Failed> {
     Ok(())
 }
 
+/// Photos of a checkerboard under the laser's line, and the rig that took them, through a lens with distortion.
+fn board_photos(args: &SimulateArgs, stop: &AtomicBool) -> std::result::Result<(), Failed> {
+    let size = parse_size(&args.size)?;
+    let rig = scene(&SimulateArgs { scene: "lens".into(), ..args.clone() })?.rig(size.0, size.1);
+    let bar = progress_bar(u64::from(BOARD_PHOTOS));
+    write_board_photos(&BoardScene::new(rig, args.seed)?, &args.out, BOARD_PHOTOS, |done| {
+        bar.set_position(u64::from(done));
+        if stop.load(Ordering::Relaxed) { Err(Error::Cancelled) } else { Ok(()) }
+    })?;
+    bar.finish_and_clear();
+    println!("{}: {BOARD_PHOTOS} photos of a 9x6 board of 25 mm squares, with rig.toml", args.out.display());
+    Ok(())
+}
+
 fn scene(args: &SimulateArgs) -> Result<Scene> {
     let mut scene = Scene::named(&args.scene)?;
     if let Some(colour) = args.laser {
-        scene.colour = match colour {
-            ColourArg::Green => LaserColour::Green,
-            ColourArg::Red => LaserColour::Red,
-            ColourArg::Blue => LaserColour::Blue,
-        };
+        scene.colour = colour.into();
     }
     if let Some(line) = args.line {
-        scene.line = match line {
-            LineArg::Vertical => LineDirection::Vertical,
-            LineArg::Horizontal => LineDirection::Horizontal,
-        };
+        scene.line = line.into();
     }
     if let Some(motion) = args.motion {
         scene.motion = match motion {

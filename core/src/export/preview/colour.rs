@@ -1,6 +1,6 @@
 //! Depth to colour: even steps of depth are even steps for the eye.
 
-use super::canvas::Rgb;
+use crate::export::canvas::Rgb;
 
 /// The ramp in OKLCh: lightness 0 to 1, chroma, hue in degrees; from near to far. Lightness falls steadily, so
 /// that the ramp also works in gray and for the colour-blind; it stops well above black, so that the relief's

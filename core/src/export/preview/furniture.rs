@@ -1,9 +1,9 @@
 //! Everything around the map: title, legend, axes, scale bar.
 
-use super::canvas::{Align, Canvas, Rgb, Style};
 use super::layout::{self, Layout, TOP_PX, WIDTH_PX};
 use super::{PreviewText, Range, colour};
 use crate::depth_map::MapGeometry;
+use crate::export::canvas::{Align, Canvas, Rgb, Style};
 
 const INK: Rgb = [31, 36, 48];
 const PALE_INK: Rgb = [98, 106, 120];

@@ -1,18 +1,23 @@
-//! A picture to draw on: rectangles, lines, hatching, text.
+//! A picture to draw on: rectangles, lines, discs, hatching, text.
+
+use std::path::Path;
 
 use ab_glyph::{Font, FontRef, Glyph, PxScale, ScaleFont, point};
 
+use png::{BitDepth, ColorType, Compression, Encoder};
+
 use crate::error::{Error, Result};
+use crate::export::new_file::NewFile;
 
 /// A colour: red, green, blue.
-pub(super) type Rgb = [u8; 3];
+pub(crate) type Rgb = [u8; 3];
 
 /// Ubuntu Light, from a library of fonts.
 const FONT: &[u8] = epaint_default_fonts::UBUNTU_LIGHT;
 
 /// Where a text's given point lies in it.
 #[derive(Clone, Copy, PartialEq)]
-pub(super) enum Align {
+pub(crate) enum Align {
     Left,
     Centre,
     Right,
@@ -20,14 +25,14 @@ pub(super) enum Align {
 
 /// How a text looks.
 #[derive(Clone, Copy)]
-pub(super) struct Style {
+pub(crate) struct Style {
     pub size_px: f32,
     pub colour: Rgb,
     pub align: Align,
 }
 
 /// The picture.
-pub(super) struct Canvas {
+pub(crate) struct Canvas {
     pub width_px: usize,
     pub height_px: usize,
     pixels: Vec<Rgb>,
@@ -35,18 +40,18 @@ pub(super) struct Canvas {
 }
 
 impl Canvas {
-    pub(super) fn new(width_px: usize, height_px: usize, background: Rgb) -> Result<Canvas> {
+    pub(crate) fn new(width_px: usize, height_px: usize, background: Rgb) -> Result<Canvas> {
         let font = FontRef::try_from_slice(FONT).map_err(|e| Error::internal("preview font", e))?;
         Ok(Canvas { width_px, height_px, pixels: vec![background; width_px * height_px], font })
     }
 
     /// The bytes: red, green, blue of each pixel.
-    pub(super) fn rgb(&self) -> &[u8] {
+    pub(crate) fn rgb(&self) -> &[u8] {
         self.pixels.as_flattened()
     }
 
     /// Mixes a colour in; outside the picture nothing happens.
-    pub(super) fn blend(&mut self, x: i64, y: i64, colour: Rgb, alpha: f32) {
+    pub(crate) fn blend(&mut self, x: i64, y: i64, colour: Rgb, alpha: f32) {
         let inside = (0..self.width_px as i64).contains(&x) && (0..self.height_px as i64).contains(&y);
         if inside {
             let pixel = &mut self.pixels[y as usize * self.width_px + x as usize];
@@ -56,7 +61,7 @@ impl Canvas {
         }
     }
 
-    pub(super) fn fill(&mut self, x: i64, y: i64, width_px: i64, height_px: i64, colour: Rgb) {
+    pub(crate) fn fill(&mut self, x: i64, y: i64, width_px: i64, height_px: i64, colour: Rgb) {
         for row in y..y + height_px {
             for column in x..x + width_px {
                 self.blend(column, row, colour, 1.0);
@@ -65,15 +70,74 @@ impl Canvas {
     }
 
     /// A rectangle's outline, drawn inside it.
-    pub(super) fn outline(&mut self, x: i64, y: i64, width_px: i64, height_px: i64, colour: Rgb) {
+    pub(crate) fn outline(&mut self, x: i64, y: i64, width_px: i64, height_px: i64, colour: Rgb) {
         self.fill(x, y, width_px, 1, colour);
         self.fill(x, y + height_px - 1, width_px, 1, colour);
         self.fill(x, y, 1, height_px, colour);
         self.fill(x + width_px - 1, y, 1, height_px, colour);
     }
 
+    /// A straight line with soft edges.
+    pub(crate) fn line(&mut self, from: (f64, f64), to: (f64, f64), width_px: f64, colour: Rgb) {
+        let (dx, dy) = (to.0 - from.0, to.1 - from.1);
+        let square = dx * dx + dy * dy;
+        self.soft_shape(
+            (from.0.min(to.0), from.1.min(to.1)),
+            (from.0.max(to.0), from.1.max(to.1)),
+            width_px,
+            colour,
+            |x, y| {
+                let along = if square > 0.0 { ((x - from.0) * dx + (y - from.1) * dy) / square } else { 0.0 };
+                let along = along.clamp(0.0, 1.0);
+                (x - from.0 - along * dx).hypot(y - from.1 - along * dy)
+            },
+        );
+    }
+
+    /// A filled circle with a soft edge.
+    pub(crate) fn disc(&mut self, centre: (f64, f64), radius_px: f64, colour: Rgb) {
+        self.soft_shape(centre, centre, 2.0 * radius_px, colour, |x, y| (x - centre.0).hypot(y - centre.1));
+    }
+
+    /// All pixels nearer than half a width to a shape that lies between two corners.
+    fn soft_shape(
+        &mut self,
+        low: (f64, f64),
+        high: (f64, f64),
+        width_px: f64,
+        colour: Rgb,
+        distance_px: impl Fn(f64, f64) -> f64,
+    ) {
+        let half = width_px / 2.0;
+        for y in (low.1 - half).floor() as i64..=(high.1 + half).ceil() as i64 {
+            for x in (low.0 - half).floor() as i64..=(high.0 + half).ceil() as i64 {
+                let cover = half + 0.5 - distance_px(x as f64, y as f64);
+                if cover > 0.0 {
+                    self.blend(x, y, colour, cover.min(1.0) as f32);
+                }
+            }
+        }
+    }
+
+    /// Writes the picture as a PNG file; it appears under its name when it is whole.
+    ///
+    /// # Errors
+    /// What the disk says.
+    pub(crate) fn save_png(&self, path: &Path) -> Result<()> {
+        let refused = |e: png::EncodingError| Error::io(path, e.into());
+        let mut file = NewFile::create(path)?;
+        let mut encoder = Encoder::new(&mut file, self.width_px as u32, self.height_px as u32);
+        encoder.set_color(ColorType::Rgb);
+        encoder.set_depth(BitDepth::Eight);
+        encoder.set_compression(Compression::Balanced);
+        let mut writer = encoder.write_header().map_err(refused)?;
+        writer.write_image_data(self.rgb()).map_err(refused)?;
+        writer.finish().map_err(refused)?;
+        file.commit()
+    }
+
     /// One pixel of the pattern that says *not measured*: pale slanting lines.
-    pub(super) fn hatch(&mut self, x: i64, y: i64) {
+    pub(crate) fn hatch(&mut self, x: i64, y: i64) {
         // Distance from the middle of the nearest line, in px along a row.
         let across = ((x + y).rem_euclid(14) - 7).abs() as f32;
         self.blend(x, y, [243, 244, 246], 1.0);
@@ -81,21 +145,21 @@ impl Canvas {
     }
 
     /// Writes on a line whose base runs through `y`.
-    pub(super) fn text(&mut self, x: f32, y: f32, text: &str, style: Style) {
+    pub(crate) fn text(&mut self, x: f32, y: f32, text: &str, style: Style) {
         for (column, row, coverage) in self.coverage(text, style) {
             self.blend(x.round() as i64 + column, y.round() as i64 + row, style.colour, coverage);
         }
     }
 
     /// Writes upwards along a line whose base runs through `x`.
-    pub(super) fn text_upwards(&mut self, x: f32, y: f32, text: &str, style: Style) {
+    pub(crate) fn text_upwards(&mut self, x: f32, y: f32, text: &str, style: Style) {
         for (column, row, coverage) in self.coverage(text, style) {
             self.blend(x.round() as i64 + row, y.round() as i64 - column, style.colour, coverage);
         }
     }
 
     /// How wide a text becomes, px.
-    pub(super) fn text_width(&self, text: &str, size_px: f32) -> f32 {
+    pub(crate) fn text_width(&self, text: &str, size_px: f32) -> f32 {
         self.glyphs(text, size_px).1
     }
 
