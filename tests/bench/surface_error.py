@@ -6,7 +6,7 @@ import numpy as np
 
 from geometry import rotation_of_vector
 
-DISCONTINUITY_MM = 0.5
+DISCONTINUITY_MM = 0.2
 """A step of more than this from one node to the next is an edge of the step gauge."""
 POINTS_FOR_ALIGNMENT = 60_000
 """The alignment looks at no more points than this, evenly picked; the statistics look at all."""
