@@ -83,4 +83,5 @@ def triangulate(stripes_px: np.ndarray, rig: dict) -> np.ndarray:
     x, y = undistort(*((along, across) if lying else (across, along)), rig["camera"])
     normal, offset_mm = laser_plane(rig["laser"])
     z_mm = offset_mm / (normal[0] * x + normal[1] * y + normal[2])
-    return np.stack([x * z_mm, y * z_mm, z_mm], axis=-1)
+    with np.errstate(invalid="ignore"):
+        return np.stack([x * z_mm, y * z_mm, z_mm], axis=-1)
