@@ -3,9 +3,9 @@
     accuracy.py RUN_DIR PRODUCTS_DIR [--json]
 
 RUN_DIR holds rig.toml and truth/ (as `stria simulate` writes them), PRODUCTS_DIR what `stria process` made of the
-run's video. Stripe errors need `--set stripe.keep=true`. Prints what applies to the run: stripe, cloud, steps, travel,
-poses, standstill, revisited places, coverage, jitter. Both worlds begin with the camera at frame 0, so they are compared
-as they are; only the cloud and the poses go through one rigid alignment, found on the cloud.
+run's video. Stripe errors need `--set stripe.keep=true`. Prints what applies to the run: stripe, cloud, steps,
+travel, poses, standstill, revisited places, coverage, jitter. Both worlds begin with the camera at frame 0, so they
+are compared as they are; only the cloud and the poses go through one rigid alignment, found on the cloud.
 """
 
 import argparse

@@ -2,9 +2,9 @@
 
     yardstick.py VIDEO --rig RIG --out DIR
 
-Area of the laser's colour, equations (7) to (9) per row, triangulation (5), Harris corners and Lucas-Kanade, median of 3
-and mean, the scale of (14), strips as wide as the image moved; out come depth.png (16 bit), cloud.ply, trajectory.csv,
-stripes.npy and manifest.json, in the form that accuracy.py reads, and the frames/s on standard output.
+Area of the laser's colour, equations (7) to (9) per row, triangulation (5), Harris corners and Lucas-Kanade, median
+of 3 and mean, the scale of (14), strips as wide as the image moved; out come depth.png (16 bit), cloud.ply,
+trajectory.csv, stripes.npy and manifest.json, in the form that accuracy.py reads, and frames/s on standard output.
 
 What it does to be fast, and all it does:
 - decoding runs ahead in a thread of its own (OpenCV gives Python's lock back), and so does the tracking of one frame
