@@ -37,6 +37,7 @@ from bench_tables import Table, accuracy_tables, memory_table, speed_table, stag
 ROOT = Path(__file__).resolve().parents[2]
 SPEED_SCENES = ("pipe", "wall")
 MEMORY_SCENE = "wall"
+BUSY_LOAD = 0.5
 PARTS = ("speed", "memory", "accuracy")
 
 
@@ -184,6 +185,8 @@ def main() -> None:
     lengths_s = [10, 60] if options.quick else [60, 600]
     if options.quick and "memory" not in skip:
         notes.append("Quick run: memory for 10 s and 60 s of video instead of 1 and 10 minutes.")
+    if (load := os.getloadavg()[0]) > BUSY_LOAD:
+        notes.append(f"Other programs were running when the bench began (load average {load:.1f}).")
     results: dict = {"machine": machine(bench), "notes": notes}
     if "speed" not in skip:
         results["speed"] = speed(bench, [by_name[name] for name in SPEED_SCENES], methods, options.rounds)

@@ -98,7 +98,8 @@ class Bench:
             graph = f"[0:v]{cut}[v]" if straight else back
             part = long.with_suffix(".part.mp4")
             if not loop.exists():
-                call([*ffmpeg, "-i", run / "video.mp4", "-filter_complex", graph, "-map", "[v]", *encode, part], "ffmpeg")
+                source = ["-i", run / "video.mp4", "-filter_complex", graph, "-map", "[v]"]
+                call([*ffmpeg, *source, *encode, part], "ffmpeg")
                 part.rename(loop)
             call([*ffmpeg, "-stream_loop", "-1", "-i", loop, "-t", seconds, "-c", "copy", part], "ffmpeg")
             part.rename(long)

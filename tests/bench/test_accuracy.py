@@ -67,7 +67,7 @@ def test_alignment_finds_a_known_motion() -> None:
 def test_noise_of_a_plane_is_its_rmse() -> None:
     generator = np.random.default_rng(2)
     plane = TrueSurface(np.full(X_MM.shape, 500.0), GRID)
-    points = np.column_stack([generator.uniform(10, 390, 50_000), generator.uniform(-140, 140, 50_000), np.zeros(50_000)])
+    points = generator.uniform((10, -140, 0), (390, 140, 0), (50_000, 3))
     points[:, 2] = 500 + generator.normal(0, 0.3, 50_000)
     figures = cloud_error(points, plane, align(points, plane))
     assert abs(figures["cloud_rmse_mm"] - 0.3) < 0.005 and abs(figures["cloud_p95_mm"] - 0.588) < 0.01
@@ -95,8 +95,10 @@ def test_travel_standstill_and_revisit() -> None:
     assert abs(standstill(true, found)["still_spread_y_mm"] - 0.4) < 1e-9
     points = np.concatenate([cloud(20_000, 3), cloud(20_000, 4) + [0, 0, 0.5]])
     frame = np.repeat([10, 80], 20_000)
-    figures = revisit(true, points, frame, TrueSurface(WAVES_MM, GRID), NOTHING)
-    assert abs(figures["revisit_median_mm"] - 0.5) < 0.03 and revisit(run(np.arange(50.0)), points, frame, None, NOTHING) == {}
+    surface = TrueSurface(WAVES_MM, GRID)
+    figures = revisit(true, points, frame, surface, NOTHING)
+    assert abs(figures["revisit_median_mm"] - 0.5) < 0.03
+    assert revisit(run(np.arange(50.0)), points, frame, surface, NOTHING) == {}
 
 
 def test_steps() -> None:
