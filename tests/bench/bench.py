@@ -37,7 +37,8 @@ from bench_tables import Table, accuracy_tables, memory_table, speed_table, stag
 ROOT = Path(__file__).resolve().parents[2]
 SPEED_SCENES = ("pipe", "wall")
 MEMORY_SCENE = "wall"
-BUSY_LOAD = 0.5
+BUSY_SHARE = 0.1
+"""Other programs that take more of the processor than this are mentioned."""
 PARTS = ("speed", "memory", "accuracy")
 
 
@@ -124,6 +125,19 @@ def machine(bench: Bench) -> dict:
     }
 
 
+def busy_share(over_s: float = 2.0) -> float:
+    """Share of all cores that other programs take, 0 to 1."""
+
+    def ticks() -> tuple[int, int]:
+        fields = [int(field) for field in Path("/proc/stat").read_text().split("\n", 1)[0].split()[1:9]]
+        return sum(fields), fields[3] + fields[4]  # all; idle and waiting for a disk
+
+    before = ticks()
+    time.sleep(over_s)
+    every, idle = (after - earlier for after, earlier in zip(ticks(), before, strict=True))
+    return 1 - idle / max(every, 1)
+
+
 def report(work: Path, results: dict, straight: bool) -> list[Table]:
     """Writes bench.json and bench.md from what there is so far; the tables."""
     tables: list[Table] = []
@@ -185,8 +199,8 @@ def main() -> None:
     lengths_s = [10, 60] if options.quick else [60, 600]
     if options.quick and "memory" not in skip:
         notes.append("Quick run: memory for 10 s and 60 s of video instead of 1 and 10 minutes.")
-    if (load := os.getloadavg()[0]) > BUSY_LOAD:
-        notes.append(f"Other programs were running when the bench began (load average {load:.1f}).")
+    if (busy := busy_share()) > BUSY_SHARE:
+        notes.append(f"Other programs took {100 * busy:.0f} % of the processor when the bench began.")
     results: dict = {"machine": machine(bench), "notes": notes}
     if "speed" not in skip:
         results["speed"] = speed(bench, [by_name[name] for name in SPEED_SCENES], methods, options.rounds)
