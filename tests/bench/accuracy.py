@@ -32,7 +32,7 @@ GROUPS = {
     "shift": ("dx_", "dy_"),
     "standstill": "still_",
     "revisited": "revisit_",
-    "map": ("coverage_", "depth_", "jitter_"),
+    "map": ("coverage_", "depth_", "jitter_", "map_"),
 }
 
 
@@ -57,8 +57,12 @@ def evaluate(run: Run, products: Products) -> dict:
         figures |= measures.travel(run, products.trajectory)
         figures |= measures.pose_error(run, products.trajectory, alignment)
         figures |= measures.standstill(run, products.trajectory)
+    if place := products.manifest.get("depth_map"):
+        figures |= {"map_width_mm": place["width_px"] * place["mm_per_px"]}
+        figures |= {"map_height_mm": place["height_px"] * place["mm_per_px"]}
     if products.depth is not None:
-        depth = products.depth
+        # A map that strays far beyond the surface would only cost memory.
+        depth = products.depth.cut(*surface.extent_mm())
         figures |= coverage(run, depth)
         figures |= measures.jitter(depth, surface)
         row, column = np.nonzero(np.isfinite(depth.z_mm))

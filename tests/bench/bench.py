@@ -72,6 +72,7 @@ def yardstick_s(bench: Bench, run: Path) -> float:
     out = bench.work / "products" / f"{run.name}-yardstick"
     script = Path(__file__).with_name("yardstick.py")
     said = call([sys.executable, script, run / "video.mp4", "--rig", run / "rig.toml", "--out", out], "the yardstick")
+    shutil.rmtree(out)
     return json.loads(said)["seconds"]
 
 

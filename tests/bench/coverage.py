@@ -50,6 +50,8 @@ def coverage(run: Run, depth: DepthMap) -> dict:
     wanted, origin = measurable_cells(run)
     if not wanted.any():
         return {"coverage_percent": None, "depth_elsewhere_percent": None}
+    if depth.z_mm.size == 0:
+        return {"coverage_percent": 0.0, "depth_elsewhere_percent": None}
     rows, columns = np.nonzero(np.isfinite(depth.z_mm))
     has = cells(depth.x_mm[columns], depth.y_mm[rows], origin, wanted.shape)
     # Maps with pixels larger than a cell: the pixel at the cell's centre speaks for it.

@@ -167,6 +167,8 @@ def revisit(run: Run, points_mm: np.ndarray, frame: np.ndarray, surface: TrueSur
 def jitter(depth: DepthMap, surface: TrueSurface) -> dict:
     """Vertical stripes of the depth map: mean |median over rows of z(column + 1) − z(column)| in mm, with the true
     surface's own taken off."""
+    if min(depth.z_mm.shape) < 2:
+        return {}
     step = np.diff(depth.z_mm.astype(float), axis=1)
     true = np.diff(surface.at(*np.meshgrid(depth.x_mm, depth.y_mm))[0], axis=1)
     both = np.isfinite(step) & np.isfinite(true)

@@ -13,6 +13,10 @@ from plyfile import PlyData
 from geometry import rotation, triangulate
 
 
+LARGEST_MAP_PX = 150_000_000
+"""A larger depth map is not read: of the bench's runs of a few metres it can only be wrong."""
+
+
 @dataclass
 class Trajectory:
     """One row a frame; NaN = not determined."""
@@ -97,6 +101,12 @@ class DepthMap:
     """[rows] world y of the pixel centres."""
     mm_per_px: float
 
+    def cut(self, x_mm: tuple[float, float], y_mm: tuple[float, float]) -> "DepthMap":
+        """The part between two x and two y (least, greatest)."""
+        columns = slice(*np.searchsorted(self.x_mm, x_mm))
+        rows = slice(*np.searchsorted(self.y_mm, y_mm))
+        return DepthMap(self.z_mm[rows, columns], self.x_mm[columns], self.y_mm[rows], self.mm_per_px)
+
 
 @dataclass
 class Products:
@@ -132,8 +142,8 @@ def read_products(folder: Path) -> Products:
 
 
 def read_depth(path: Path, place: dict | None) -> DepthMap | None:
-    """The depth map, placed by the manifest's `depth_map`."""
-    if not path.exists() or not place:
+    """The depth map, placed by the manifest's `depth_map`; None where there is none, or a much too large one."""
+    if not path.exists() or not place or place["width_px"] * place["height_px"] > LARGEST_MAP_PX:
         return None
     z_mm = tifffile.imread(path, key=0)
     step = place["mm_per_px"]

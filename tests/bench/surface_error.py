@@ -28,6 +28,12 @@ class TrueSurface:
         if any(feature["kind"] == "step" for feature in surface.get("features", [])):
             self.z_mm = np.where(beside_an_edge(self.z_mm), np.nan, self.z_mm)
 
+    def extent_mm(self) -> tuple[tuple[float, float], tuple[float, float]]:
+        """(least x, greatest x), (least y, greatest y)."""
+        rows, columns = self.z_mm.shape
+        x, y = self.x0_mm, self.y0_mm
+        return (x, x + self.step_mm * (columns - 1)), (y, y + self.step_mm * (rows - 1))
+
     def at(self, x_mm: np.ndarray, y_mm: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """z in mm and its slopes dz/dx, dz/dy at places of any one shape; NaN off the surface."""
         rows, columns = self.z_mm.shape
