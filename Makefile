@@ -1,5 +1,5 @@
 # Everything a person does with Stria's sources. `make demo` and `make test` need only Debian 12, Rust, Node and make.
-.PHONY: demo test check setup web build
+.PHONY: demo test bench check setup web build
 
 # Sets up, builds, makes a realistic run, processes it through the server and says which URL to open.
 demo: build
@@ -9,6 +9,10 @@ demo: build
 test: build
 	cargo test --release --locked --workspace
 	cd tests/browser && npm test
+
+# Speed, memory and accuracy on this machine in one run, over simulated full HD runs; BENCH="--help" explains the rest.
+bench: build
+	target/python/bin/python tests/bench/bench.py $(BENCH)
 
 # Format, lints and docs as errors.
 check: setup web

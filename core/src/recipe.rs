@@ -162,7 +162,7 @@ recipe! {
         /// Places on the wall that are followed, about; one per cell of a grid over the image.
         landmarks: u32 = 110, "", whole(12, 2000);
         /// Least texture of such a place: the weaker direction's mean squared slope of the luma.
-        texture_min: f64 = 2.0, "levels² a px²", number(0.0, 10000.0);
+        texture_min: f64 = 0.15, "levels² a px²", number(0.0, 10000.0);
         /// Travel of the image from one key frame to the next, as a share of its width.
         keyframe_share: f64 = 0.1, "of the width", number(0.01, 0.5);
         /// Key frames whose poses are still adjusted together; each frame waits until its key frames are settled.
