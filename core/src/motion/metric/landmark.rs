@@ -9,6 +9,8 @@ use crate::rig::Camera;
 
 /// A patch is made anew when the view turns or stretches it by more than this.
 const STRETCH_STEP: f32 = 0.006;
+/// Least standard deviation of a place found by a landmark's recent look: errors of one frame add to the next one's.
+const RECENT_SIGMA_PX: f32 = 0.25;
 /// Side of the blocks whose texture is summed, px of the shrunk image.
 const BLOCK: usize = SIDE / 2 / SHRINK;
 /// Distance of a landmark from the image's edge, px of the shrunk image.
@@ -29,6 +31,8 @@ pub(super) struct Landmark {
     stretch: Stretch,
     /// The patch in the shrunk image, and how far its whole pixel lies from the place, small px.
     small: Option<(Patch, (f32, f32))>,
+    /// How it looked when it was last seen, and how far the place lies from that piece's whole pixel, px.
+    recent: Option<(Kept, (f32, f32))>,
     /// Sights in key frames; the `view` of each is filled in for an adjustment.
     pub sights: Vec<InKeyframe<PlaceSight>>,
     pub depths: Vec<InKeyframe<PlaceDepth>>,
@@ -75,6 +79,7 @@ impl Landmark {
             patch,
             stretch: UPRIGHT,
             small,
+            recent: None,
             sights: Vec::new(),
             depths: Vec::new(),
             measured: false,
@@ -90,7 +95,8 @@ impl Landmark {
         project(camera, &(camera_from_world * self.world))
     }
 
-    /// Looks for the patch, turned and stretched as the pose says (which sees it `at`), around a place `near` there.
+    /// Looks for the patch, turned and stretched as the pose says (which sees it `at`), around a place `near` there. `None` where
+    /// nothing is at least so like it.
     pub(super) fn find(
         &mut self,
         image: Gray<'_>,
@@ -99,6 +105,7 @@ impl Landmark {
         at: (f64, f64),
         near: (f64, f64),
         largest_px: f32,
+        least_likeness: f32,
     ) -> Option<Found> {
         let stretch = self.stretch_seen(camera, camera_from_world, at)?;
         let change = (0..2).flat_map(|i| (0..2).map(move |j| (i, j)));
@@ -106,7 +113,26 @@ impl Landmark {
             self.patch = self.kept.patch(stretch)?;
             self.stretch = stretch;
         }
-        self.patch.find(image, (near.0 as f32, near.1 as f32), largest_px)
+        let near = (near.0 as f32, near.1 as f32);
+        let found = self.patch.find(image, near, largest_px).filter(|f| f.likeness >= least_likeness);
+        found.or_else(|| {
+            // It does not look any more as it did at first: then as it did a moment ago, which is less certain.
+            let (kept, offset) = self.recent.as_ref()?;
+            let found = kept.patch(UPRIGHT)?.find(image, (near.0 - offset.0, near.1 - offset.1), largest_px)?;
+            (found.likeness >= least_likeness).then_some(Found {
+                x: found.x + offset.0,
+                y: found.y + offset.1,
+                sigma: found.sigma.max(RECENT_SIGMA_PX),
+                ..found
+            })
+        })
+    }
+
+    /// Keeps how it looks now, at a place where it was found.
+    pub(super) fn remember(&mut self, image: Gray<'_>, place: (f32, f32)) {
+        let whole = (place.0.round(), place.1.round());
+        let kept = Kept::cut(image, whole.0 as usize, whole.1 as usize);
+        self.recent = kept.map(|kept| (kept, (place.0 - whole.0, place.1 - whole.1)));
     }
 
     fn stretch_seen(&self, camera: &Camera, pose: &Isometry3<f64>, at: (f64, f64)) -> Option<Stretch> {

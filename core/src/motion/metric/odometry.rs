@@ -32,8 +32,8 @@ const PROBES: usize = 14;
 /// Share of the probes that must be found.
 const PROBES_FOUND: f64 = 0.6;
 /// Least likeness of a patch that is believed; in the shrunk image.
-const LEAST_LIKENESS: f32 = 0.6;
-const LEAST_LIKENESS_SMALL: f32 = 0.7;
+const LEAST_LIKENESS: f32 = 0.5;
+const LEAST_LIKENESS_SMALL: f32 = 0.4;
 /// Standard deviation of a place found in the shrunk image, px of the full one.
 const COARSE_SIGMA_PX: f64 = 1.5;
 /// Share of the landmarks in view that must be found in the full image; else the shrunk one helps, which is less noisy.
@@ -306,7 +306,9 @@ impl Odometry {
         mut last: Last,
     ) -> Motion {
         self.lost += 1;
-        if self.lost > self.options.lost_max && profile.points.len() >= FEWEST_POINTS {
+        // At the very start of a part nothing is lost with it.
+        let lost_max = if self.keyframes.len() < 2 { 0 } else { self.options.lost_max };
+        if self.lost > lost_max && profile.points.len() >= FEWEST_POINTS {
             self.lost = 0;
             self.part += 1;
             let pose = last.pose;
@@ -413,8 +415,7 @@ impl Odometry {
         let probes: Vec<_> = visible.into_iter().step_by(step).collect();
         let found = probes.iter().filter(|(id, at)| {
             let Some(landmark) = self.landmarks.get_mut(id) else { return false };
-            let found = landmark.find(view.gray, &self.rig.camera, pose, *at, *at, NEAR_PX);
-            found.is_some_and(|f| f.likeness >= LEAST_LIKENESS)
+            landmark.find(view.gray, &self.rig.camera, pose, *at, *at, NEAR_PX, LEAST_LIKENESS).is_some()
         });
         found.count() as f64 >= PROBES_FOUND * probes.len() as f64
     }
@@ -474,8 +475,7 @@ impl Odometry {
             let camera = &self.rig.camera;
             let Some(landmark) = self.landmarks.get_mut(id) else { continue };
             let near = places.get(id).copied().unwrap_or(*at);
-            let place = landmark.find(view.gray, camera, start, *at, near, NEAR_PX);
-            found.push((*id, place.filter(|f| f.likeness >= LEAST_LIKENESS)));
+            found.push((*id, landmark.find(view.gray, camera, start, *at, near, NEAR_PX, LEAST_LIKENESS)));
         }
         if (found.iter().filter(|(_, f)| f.is_some()).count() as f64) < FOUND_SHARE * found.len() as f64 {
             for ((id, place), (_, at)) in found.iter_mut().zip(&visible).filter(|((_, place), _)| place.is_none()) {
@@ -520,6 +520,7 @@ impl Odometry {
             }
             landmark.misses = 0;
             landmark.last_frame = view.frame;
+            landmark.remember(view.gray, at);
             places.insert(sight.landmark, at);
             good.push(sight);
         }
