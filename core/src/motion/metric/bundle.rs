@@ -40,12 +40,30 @@ pub(super) struct PlaceSight {
 }
 
 /// What is known of a landmark's depth: `direction · point = distance_mm` in a key frame's camera.
+///
+/// A guess errs by a share, in the inverse of the depth: what is taken to be near may be far away, not the other way
+/// round.
 #[derive(Clone, Copy, Debug)]
 pub(super) struct PlaceDepth {
+    /// A guess from the neighbours, not a measurement.
+    pub guess: bool,
     pub view: usize,
     pub direction: Vector3<f64>,
     pub distance_mm: f64,
     pub sigma_mm: f64,
+}
+
+impl PlaceDepth {
+    /// How far short of the known depth a point is, mm, and how much less short it gets with each mm further away.
+    fn miss_mm(&self, point: &Point3<f64>) -> (f64, f64) {
+        let (known, found) = (self.distance_mm, self.direction.dot(&point.coords));
+        if !self.guess {
+            return (known - found, 1.0);
+        }
+        let found = found.max(0.05 * known);
+        let share = known / found;
+        (known * (share - 1.0), share * share)
+    }
 }
 
 type Block = SMatrix<f64, 6, 3>;
@@ -81,7 +99,7 @@ pub(super) fn total_cost(views: &[View], places: &[Place]) -> f64 {
         });
         let depths = place.depths.iter().map(|depth| {
             let p = views[depth.view].camera_from_world * place.world;
-            huber((depth.distance_mm - depth.direction.dot(&p.coords)).abs() / depth.sigma_mm)
+            huber(depth.miss_mm(&p).0.abs() / depth.sigma_mm)
         });
         sights.chain(depths).sum::<f64>()
     };
@@ -175,10 +193,10 @@ impl Equations {
         for depth in &place.depths {
             let pose = &views[depth.view].camera_from_world;
             let p = pose * place.world;
-            let miss = depth.distance_mm - depth.direction.dot(&p.coords);
+            let (miss, slope) = depth.miss_mm(&p);
             let weight = robust(miss.abs() / depth.sigma_mm) / (depth.sigma_mm * depth.sigma_mm);
-            let turn = p.coords.cross(&depth.direction);
-            let d = depth.direction;
+            let d = slope * depth.direction;
+            let turn = p.coords.cross(&d);
             let by_move = Vector6::new(turn.x, turn.y, turn.z, d.x, d.y, d.z);
             let by_place = pose.rotation.inverse() * d;
             equations.add(free[depth.view], &by_move, &by_place, weight, miss);
@@ -261,6 +279,7 @@ mod tests {
                     PlaceSight { view, ray: [c.x / c.z, c.y / c.z], sigma: 1e-4 }
                 });
                 let depth = PlaceDepth {
+                    guess: n % 3 != 0,
                     view: 2,
                     direction: Vector3::z(),
                     distance_mm: (truth(2) * p).z,

@@ -505,7 +505,7 @@ impl Odometry {
         }
         let mut solved = pose::solve(start, &sights, hold(HOLD_RAD))?;
         let mut degrees_of_freedom = 6;
-        if rotation_sigma(&solved.information) > ROTATION_SIGMA_RAD {
+        if self.keyframes.len() > EARLY_KEYFRAMES && rotation_sigma(&solved.information) > ROTATION_SIGMA_RAD {
             degrees_of_freedom = 3;
             solved = pose::solve(start, &sights, hold(HOLD_FIRM_RAD))?;
         }
@@ -556,6 +556,7 @@ impl Odometry {
             }
             let rotation = from_keyframe.rotation.inverse();
             let depth = PlaceDepth {
+                guess: false,
                 view: 0,
                 direction: rotation * Vector3::z(),
                 distance_mm: z_mm - from_keyframe.translation.z,
@@ -689,7 +690,8 @@ impl Odometry {
             landmark.covariance = direction * direction.transpose() * (sigma_mm * sigma_mm)
                 + Matrix3::identity() * (sight_sigma * z_mm).powi(2);
             landmark.sights.push((number, PlaceSight { view: 0, ray, sigma: sight_sigma }));
-            let depth = PlaceDepth { view: 0, direction: Vector3::z(), distance_mm: z_mm, sigma_mm };
+            let depth =
+                PlaceDepth { guess: true, view: 0, direction: Vector3::z(), distance_mm: z_mm, sigma_mm };
             landmark.depths.push((number, depth));
             landmark.last_frame = view.frame;
             self.landmarks.insert(self.next_landmark, landmark);
