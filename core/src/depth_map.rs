@@ -11,6 +11,7 @@ use std::collections::{HashMap, HashSet};
 use std::fs::File;
 use std::os::unix::fs::FileExt;
 use std::path::Path;
+use std::sync::{Mutex, MutexGuard, PoisonError};
 
 use serde::{Deserialize, Serialize};
 
@@ -90,6 +91,44 @@ impl MapReader for FinishedMap<'_> {
 
     fn window(&mut self, column_px: usize, row_px: usize, width_px: usize, height_px: usize) -> Result<MapWindow> {
         self.map.window(column_px, row_px, width_px, height_px)
+    }
+}
+
+/// A map that several threads read, one rectangle at a time.
+pub struct SharedMap<'a, 'm> {
+    map: Mutex<&'a mut FinishedMap<'m>>,
+}
+
+/// One thread's view of a [`SharedMap`].
+pub struct SharedReader<'s, 'a, 'm> {
+    shared: &'s SharedMap<'a, 'm>,
+    geometry: MapGeometry,
+}
+
+impl<'a, 'm> SharedMap<'a, 'm> {
+    /// Shares a map.
+    pub fn new(map: &'a mut FinishedMap<'m>) -> SharedMap<'a, 'm> {
+        SharedMap { map: Mutex::new(map) }
+    }
+
+    /// A reader for one thread.
+    pub fn reader(&self) -> SharedReader<'_, 'a, 'm> {
+        SharedReader { shared: self, geometry: self.lock().geometry }
+    }
+
+    /// A thread that panicked while it read has changed nothing that matters.
+    fn lock(&self) -> MutexGuard<'_, &'a mut FinishedMap<'m>> {
+        self.map.lock().unwrap_or_else(PoisonError::into_inner)
+    }
+}
+
+impl MapReader for SharedReader<'_, '_, '_> {
+    fn geometry(&self) -> MapGeometry {
+        self.geometry
+    }
+
+    fn window(&mut self, column_px: usize, row_px: usize, width_px: usize, height_px: usize) -> Result<MapWindow> {
+        self.shared.lock().window(column_px, row_px, width_px, height_px)
     }
 }
 
@@ -190,7 +229,11 @@ impl SurfaceMap {
                 let (depth, weight) = (&mut tile.depth_mm[at], &mut tile.weight[at]);
                 new += u64::from(depth.is_nan());
                 *weight += cell.weight;
-                *depth = if depth.is_nan() { cell.depth_mm } else { *depth + (cell.depth_mm - *depth) * cell.weight / *weight };
+                *depth = if depth.is_nan() {
+                    cell.depth_mm
+                } else {
+                    *depth + (cell.depth_mm - *depth) * cell.weight / *weight
+                };
                 if let (Some([red, green, blue]), [.., 0]) = (cell.rgb, tile.texture[at]) {
                     tile.texture[at] = [red, green, blue, 1];
                 }
@@ -323,7 +366,8 @@ impl SurfaceMap {
             .map_err(|e| Error::io(&self.scratch_path, e))?;
         let (depth, rest) = bytes.split_at(TILE_PX * 4);
         let (weight, texture) = rest.split_at(TILE_PX * 4);
-        let floats = |bytes: &[u8]| bytes.chunks_exact(4).map(|b| f32::from_le_bytes([b[0], b[1], b[2], b[3]])).collect();
+        let floats =
+            |bytes: &[u8]| bytes.chunks_exact(4).map(|b| f32::from_le_bytes([b[0], b[1], b[2], b[3]])).collect();
         Ok(Tile {
             depth_mm: floats(depth),
             weight: floats(weight),

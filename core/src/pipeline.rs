@@ -150,7 +150,8 @@ fn measure_and_write(
 ) -> Result<Manifest> {
     let mut products = Products::create(request, info)?;
     let mut quality = QualityCounter::new();
-    let mut run = Run { request, products: &mut products, quality: &mut quality, progress, timings: Timings::default() };
+    let mut run =
+        Run { request, products: &mut products, quality: &mut quality, progress, timings: Timings::default() };
     match request.recipe.method {
         Method::Metric => metric::measure(&mut run, source)?,
         Method::Paper => paper::measure(&mut run, source)?,

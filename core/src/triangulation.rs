@@ -85,7 +85,11 @@ mod tests {
     use crate::rig::{LaserColour, LineDirection};
 
     fn stripe_at(column_px: f32) -> Stripe {
-        Stripe { across_px: vec![column_px; 720], confidence: vec![1.0; 720], ..Stripe::empty(LineDirection::Vertical, 720) }
+        Stripe {
+            across_px: vec![column_px; 720],
+            confidence: vec![1.0; 720],
+            ..Stripe::empty(LineDirection::Vertical, 720)
+        }
     }
 
     #[test]

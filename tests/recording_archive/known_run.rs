@@ -91,7 +91,7 @@ impl KnownRun {
                 line: LineDirection::Vertical,
                 across_px: vec![u as f32; rows],
                 confidence: vec![0.8; rows],
-            sigma_px: vec![0.1; rows],
+                sigma_px: vec![0.1; rows],
             },
             shift: self.shift(index, shift_px),
             points: surface(&profile, &pose, index),

@@ -27,8 +27,8 @@ use container::{Container, Entry, Value};
 
 /// Side of a tile, px.
 const SIDE_PX: usize = 512;
-/// Deflate's effort, 0 to 9: above 4 the files hardly shrink, the time doubles.
-const EFFORT: u32 = 4;
+/// Deflate's effort, 0 to 9: above 1 the files shrink by a tenth, the time doubles.
+const EFFORT: u32 = 1;
 
 /// Writes the map to `path`; as BigTIFF where the file would pass 4 GB.
 ///

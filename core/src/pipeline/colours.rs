@@ -19,8 +19,9 @@ const CLEAR_SHARE: f64 = 0.9;
 const CLEAR_OF_LINE: f32 = 0.02;
 
 /// Finds colours for frames, at once or later.
-#[derive(Default)]
 pub(super) struct ColourFinder {
+    /// Only at the profiles themselves, not between them.
+    points_only: bool,
     before: Vec<Option<Point3<f64>>>,
     late: VecDeque<Strip>,
     done: Vec<(u32, WallColours)>,
@@ -35,6 +36,11 @@ struct Strip {
 }
 
 impl ColourFinder {
+    /// A finder of the colours at the profiles (`points_only`), or also between them.
+    pub(super) fn new(points_only: bool) -> ColourFinder {
+        ColourFinder { points_only, before: Vec::new(), late: VecDeque::new(), done: Vec::new() }
+    }
+
     /// Takes a frame's profile; `earlier` is a frame that shows its wall without the laser.
     pub(super) fn add(
         &mut self,
@@ -53,17 +59,22 @@ impl ColourFinder {
         for point in &profile.points {
             now[point.line_position as usize] = Some(world_from_camera * point.point_in_camera);
         }
+        if self.points_only {
+            return self.keep(Strip { frame, before: Vec::new(), now, steps: 1 }, rig, earlier);
+        }
         let pixel_mm = profile.median_z_mm().unwrap_or(1.0) / rig.camera.fx_px;
         let before = std::mem::replace(&mut self.before, now.clone());
         let mut apart: Vec<f64> =
             before.iter().zip(&now).step_by(8).filter_map(|(a, b)| Some((a.as_ref()? - b.as_ref()?).norm())).collect();
         let middle = apart.len() / 2;
-        let apart_mm =
-            if apart.is_empty() { 0.0 } else { *apart.select_nth_unstable_by(middle, f64::total_cmp).1 };
+        let apart_mm = if apart.is_empty() { 0.0 } else { *apart.select_nth_unstable_by(middle, f64::total_cmp).1 };
         let steps = ((apart_mm / (1.5 * pixel_mm)).ceil() as usize).clamp(1, MAX_STEPS);
-        let strip = Strip { frame, before, now, steps };
+        self.keep(Strip { frame, before, now, steps }, rig, earlier);
+    }
+
+    fn keep(&mut self, strip: Strip, rig: &Rig, earlier: Option<&Recent>) {
         match earlier {
-            Some(recent) => self.done.push((frame, strip.colours(rig, recent))),
+            Some(recent) => self.done.push((strip.frame, strip.colours(rig, recent))),
             None => {
                 self.late.push_back(strip);
                 if self.late.len() > MAX_LATE {

@@ -8,7 +8,7 @@ use super::reading::{self, Seen};
 use super::recent::{Recent, RecentFrames};
 use super::{Cargo, Colours, Picture, Run};
 use crate::depth_map::sheet::WallColours;
-use crate::error::{Error, Result};
+use crate::error::Result;
 use crate::motion::metric::{Odometry, SettledPose};
 use crate::source::Source;
 use crate::stripe::metric::{StripeFinder, measure_stripe};
@@ -21,11 +21,11 @@ const MAX_PICTURES: usize = 12;
 /// The order of the stages, frame by frame.
 pub(super) fn measure(run: &mut Run<'_, '_, '_, '_>, source: Box<dyn Source>) -> Result<()> {
     let (rig, recipe) = (&run.request.rig, &run.request.recipe);
-    let colours_wanted = run.products.wants_colours();
+    let (colours_wanted, between) = (run.products.wants_colours(), run.products.wants_wall_colours());
     let mut odometry = Odometry::new(rig, &recipe.pose);
     let mut recent = RecentFrames::default();
     let mut waiting = WaitingFrames::default();
-    let mut colours = ColourFinder::default();
+    let mut colours = ColourFinder::new(!between);
     std::thread::scope(|scope| {
         // Source ▶ Frame ▶ the line as the frame alone shows it, in a thread of their own.
         let mut finder = StripeFinder::new(&rig.laser, &recipe.spot);
@@ -50,8 +50,7 @@ pub(super) fn measure(run: &mut Run<'_, '_, '_, '_>, source: Box<dyn Source>) ->
             let moved_px = motion.shift.dx_px.unwrap_or(0.0).hypot(motion.shift.dy_px.unwrap_or(0.0));
             let image = Arc::new(frame.image);
             let picture = run.products.wants_picture(frame.time_s) && waiting.pictures() < MAX_PICTURES;
-            let picture =
-                picture.then(|| Picture { image: image.clone(), effective_area: None, row_threshold: None });
+            let picture = picture.then(|| Picture { image: image.clone(), effective_area: None, row_threshold: None });
             // The wall's colours, from a frame that shows it without the laser: an earlier one, or else a later one.
             if colours_wanted && let Some(pose) = pose {
                 let earlier = wall.map(|(recent, _)| recent);
@@ -78,7 +77,7 @@ pub(super) fn measure(run: &mut Run<'_, '_, '_, '_>, source: Box<dyn Source>) ->
         run.timings.time("motion", || odometry.finish());
         let settled = odometry.take_settled();
         run.add(waiting.place(settled))?;
-        let report = reading.join().map_err(|_| Error::internal("source", "the reading thread panicked"))?;
+        let report = reading.join()?;
         run.timings.add("decoding", report.decoding);
         run.timings.add("stripe", report.stripes);
         report.warnings.into_iter().try_for_each(|warning| run.progress.warn(warning))

@@ -6,7 +6,7 @@ use super::products::Products;
 use super::reading::{self, Seen};
 use super::{Cargo, Colours, Picture, Run};
 use crate::depth_map::strips::TextureStrip;
-use crate::error::{Error, Result};
+use crate::error::Result;
 use crate::motion::Shift;
 use crate::motion::paper::ImageTracker;
 use crate::rig::LineDirection;
@@ -50,7 +50,7 @@ pub(super) fn measure(run: &mut Run<'_, '_, '_, '_>, source: Box<dyn Source>) ->
             run.add(placement.push(measured))?;
         }
         run.add(placement.finish())?;
-        let report = reading.join().map_err(|_| Error::internal("source", "the reading thread panicked"))?;
+        let report = reading.join()?;
         run.timings.add("decoding", report.decoding);
         run.timings.add("stripe", report.stripes);
         report.warnings.into_iter().try_for_each(|warning| run.progress.warn(warning))

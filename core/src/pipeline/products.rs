@@ -7,7 +7,7 @@ use super::quality::QualityCounter;
 use super::{Cargo, Colours, Event, ProductGroup, Request, Timings};
 use crate::depth_map::sheet::Sheet;
 use crate::depth_map::strips::{add_strip, strip_grid};
-use crate::depth_map::{FinishedMap, Grid, MapReader, SurfaceMap};
+use crate::depth_map::{FinishedMap, Grid, MapReader, SharedMap, SurfaceMap};
 use crate::error::{Error, Result};
 use crate::export::archive_mcap::ArchiveWriter;
 use crate::export::cloud_ply::CloudPlyWriter;
@@ -92,6 +92,14 @@ impl<'a> Products<'a> {
         // The depth maps alone, the trajectory and the stripes have none.
         let coloured = |group: &ProductGroup| !matches!(group, ProductGroup::Depth | ProductGroup::Trajectory);
         self.request.products.iter().any(coloured)
+    }
+
+    /// Whether any product shows the wall's colours between the profiles too.
+    pub(super) fn wants_wall_colours(&self) -> bool {
+        let shows = |group: &ProductGroup| {
+            !matches!(group, ProductGroup::Depth | ProductGroup::Trajectory | ProductGroup::Cloud)
+        };
+        self.request.products.iter().any(shows)
     }
 
     /// Keeps a stripe, in the order of the frames.
@@ -285,8 +293,14 @@ impl<'a> Products<'a> {
         let mut gray = None;
         if wanted.contains(&ProductGroup::Depth) {
             progress.step("depth")?;
-            depth_tif::write(map, &folder.join("depth.tif"))?;
-            gray = depth_png::write(map, folder)?;
+            // Both squeeze the whole map: at the same time, each on its own core.
+            let shared = SharedMap::new(map);
+            gray = std::thread::scope(|scope| {
+                let tif = scope.spawn(|| depth_tif::write(&mut shared.reader(), &folder.join("depth.tif")));
+                let gray = depth_png::write(&mut shared.reader(), folder);
+                tif.join().map_err(|_| Error::internal("depth.tif", "its thread panicked"))??;
+                gray
+            })?;
         }
         if wanted.contains(&ProductGroup::Texture) {
             progress.step("texture")?;

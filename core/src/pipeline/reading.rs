@@ -1,4 +1,4 @@
-//! The reading thread: frames and their stripes, a few ahead of the rest of the work.
+//! The reading threads: one decodes, one finds in each frame what it shows alone, a few frames ahead of the rest.
 
 use std::sync::mpsc::{Receiver, SyncSender, sync_channel};
 use std::thread::{Scope, ScopedJoinHandle};
@@ -29,26 +29,51 @@ pub(super) struct ReadingReport {
     pub stripes: Duration,
 }
 
-/// Starts the thread. It ends at the source's end, at an error, or when nobody listens any more.
+/// Starts the threads. They end at the source's end, at an error, or when nobody listens any more.
 pub(super) fn start<'scope, T: Send + 'scope>(
     scope: &'scope Scope<'scope, '_>,
     source: Box<dyn Source>,
     rig: &'scope Rig,
     recipe: &'scope Recipe,
-    find: impl FnMut(&Frame) -> Result<T> + Send + 'scope,
-) -> (Receiver<Result<Seen<T>>>, ScopedJoinHandle<'scope, ReadingReport>) {
+    mut find: impl FnMut(&Frame) -> Result<T> + Send + 'scope,
+) -> (Receiver<Result<Seen<T>>>, Reading<'scope>) {
+    let (decoded, frames) = sync_channel(FRAMES_WAIT);
     let (sender, receiver) = sync_channel(FRAMES_WAIT);
-    let thread = scope.spawn(move || read(source, rig, recipe, find, &sender));
-    (receiver, thread)
+    let decoding = scope.spawn(move || decode(source, rig, recipe, &decoded));
+    let finding = scope.spawn(move || {
+        let mut time = Duration::ZERO;
+        for frame in frames {
+            let start = Instant::now();
+            let seen = frame.and_then(|frame| find(&frame).map(|found| Seen { frame, found }));
+            time += start.elapsed();
+            let failed = seen.is_err();
+            // Nobody listens only after a cancel, which has said its own.
+            if sender.send(seen).is_err() || failed {
+                break;
+            }
+        }
+        time
+    });
+    (receiver, Reading { decoding, finding })
 }
 
-fn read<T>(
-    mut source: Box<dyn Source>,
-    rig: &Rig,
-    recipe: &Recipe,
-    mut find: impl FnMut(&Frame) -> Result<T>,
-    out: &SyncSender<Result<Seen<T>>>,
-) -> ReadingReport {
+/// The threads at work.
+pub(super) struct Reading<'scope> {
+    decoding: ScopedJoinHandle<'scope, ReadingReport>,
+    finding: ScopedJoinHandle<'scope, Duration>,
+}
+
+impl Reading<'_> {
+    /// Waits for their end.
+    pub(super) fn join(self) -> Result<ReadingReport> {
+        let panicked = |_| Error::internal("source", "a reading thread panicked");
+        let finding = self.finding.join().map_err(panicked)?;
+        let report = self.decoding.join().map_err(panicked)?;
+        Ok(ReadingReport { stripes: finding, ..report })
+    }
+}
+
+fn decode(mut source: Box<dyn Source>, rig: &Rig, recipe: &Recipe, out: &SyncSender<Result<Frame>>) -> ReadingReport {
     let mut report = ReadingReport::default();
     let limit = recipe.limits.max_frames;
     for count in 0.. {
@@ -58,20 +83,13 @@ fn read<T>(
                 report.warnings.push(format!("only the first {limit} frames were processed (limits.max_frames)"));
                 break;
             }
-            Ok(Some(frame)) => frame,
+            Ok(Some(frame)) => check_size(&frame, rig).map(|()| frame),
             Ok(None) => break,
-            Err(error) => {
-                // Nobody listens only after a cancel, which has said its own.
-                let _ = out.send(Err(error));
-                break;
-            }
+            Err(error) => Err(error),
         };
         report.decoding += start.elapsed();
-        let start = Instant::now();
-        let seen = check_size(&frame, rig).and_then(|()| find(&frame)).map(|found| Seen { frame, found });
-        report.stripes += start.elapsed();
-        let failed = seen.is_err();
-        if out.send(seen).is_err() || failed {
+        let failed = frame.is_err();
+        if out.send(frame).is_err() || failed {
             break;
         }
     }

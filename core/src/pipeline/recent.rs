@@ -62,7 +62,8 @@ impl Recent {
             LineDirection::Horizontal => (v, u),
         };
         let inside = u >= 0.0 && v >= 0.0 && u < (camera.width_px - 1) as f32 && v < (camera.height_px - 1) as f32;
-        let lit = self.line_px.get(along.round().max(0.0) as usize).is_some_and(|line| (line - across).abs() < margin_px);
+        let lit =
+            self.line_px.get(along.round().max(0.0) as usize).is_some_and(|line| (line - across).abs() < margin_px);
         (inside && !lit).then_some((across, along))
     }
 }
@@ -107,7 +108,8 @@ impl RecentFrames {
         margin_px: f32,
     ) -> Option<(&Recent, Wall<'_>)> {
         let world_from_camera = camera_from_world.inverse();
-        let place = |recent: &Recent, p: &Point3<f64>| recent.clear_place(&rig.camera, &(world_from_camera * p), margin_px);
+        let place =
+            |recent: &Recent, p: &Point3<f64>| recent.clear_place(&rig.camera, &(world_from_camera * p), margin_px);
         let step = (profile.points.len() / 24).max(1);
         let probes: Vec<&Point3<f64>> = profile.points.iter().step_by(step).map(|p| &p.point_in_camera).collect();
         let clear = |recent: &&Recent| {

@@ -77,7 +77,8 @@ impl Image {
                 Yuv { format: *format, colours: Coefficients::of(format), y: plane(0), u: plane(1), v: plane(2) }
             }
             Given::Bgr => {
-                let own = self.yuv.get_or_init(|| own_planes(self.width_px as usize, self.height_px as usize, self.bgr()));
+                let own =
+                    self.yuv.get_or_init(|| own_planes(self.width_px as usize, self.height_px as usize, self.bgr()));
                 let width = own.format.width_px;
                 let plane = |data, stride_bytes| PlaneView { data, stride_bytes };
                 let chroma_width = width.div_ceil(2);
@@ -168,7 +169,8 @@ impl<'a> Yuv<'a> {
     pub fn rgb(&self, column: usize, row: usize) -> [u8; 3] {
         let luma = self.y.data[row * self.y.stride_bytes + column];
         let at = |plane: &PlaneView| {
-            plane.data[(row >> self.format.chroma_shift_y) * plane.stride_bytes + (column >> self.format.chroma_shift_x)]
+            plane.data
+                [(row >> self.format.chroma_shift_y) * plane.stride_bytes + (column >> self.format.chroma_shift_x)]
         };
         let [blue, green, red] = self.colours.bgr(luma, at(&self.u), at(&self.v));
         [red, green, blue]
@@ -186,9 +188,9 @@ fn own_planes(width: usize, height: usize, bgr: &[u8]) -> OwnPlanes {
         matrix: Matrix::Bt601,
         full_range: true,
     };
-    let y = bgr.chunks_exact(3).map(|p| {
-        ((7471 * u32::from(p[0]) + 38470 * u32::from(p[1]) + 19595 * u32::from(p[2]) + 32768) >> 16) as u8
-    });
+    let y = bgr
+        .chunks_exact(3)
+        .map(|p| ((7471 * u32::from(p[0]) + 38470 * u32::from(p[1]) + 19595 * u32::from(p[2]) + 32768) >> 16) as u8);
     let y: Vec<u8> = y.collect();
     let (chroma_width, chroma_height) = (width.div_ceil(2), height.div_ceil(2));
     let (mut u, mut v) = (Vec::with_capacity(chroma_width * chroma_height), Vec::new());

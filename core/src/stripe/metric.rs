@@ -42,6 +42,9 @@ const COLOUR_SIGMA_PX: f32 = 2.0;
 const PIECE_MIN_GROUPS: usize = 2;
 /// Groups on each side that say where the line goes on.
 const LINE_REACH: usize = 10;
+/// A centre has settled when it moves less than this, px: before the wall's pattern is taken out, and after.
+const SETTLED_PLAIN_PX: f32 = 0.02;
+const SETTLED_PX: f32 = 0.005;
 /// Two candidates closer than this are one, px.
 const SAME_START_PX: f32 = 3.0;
 
@@ -80,8 +83,8 @@ impl StripeFinder {
 
     /// Finds the line in a frame.
     pub fn see(&mut self, image: Yuv<'_>) -> Seen {
-        let mut candidates =
-            evidence::ridges(image, self.laser.colour, self.laser.line, self.options.evidence_min as f32);
+        let least = self.options.evidence_min as f32;
+        let mut candidates = evidence::ridges(image, self.laser.colour, self.laser.line, self.width_px, least);
         // The choice counts in steps from row to row: here a row is a group of them.
         let group = GROUP as f32;
         candidates.iter_mut().flatten().for_each(|c| c.across_px /= group);
@@ -125,7 +128,7 @@ impl StripeFinder {
             seen.starts[position] = first;
             let profile = &mut seen.light[position * samples..][..samples];
             luma.read(position, first as usize, light, profile);
-            let spot = seen.shape.find(profile, Background::Sides, seen.shape.half as f32);
+            let spot = seen.shape.find(profile, Background::Sides, seen.shape.half as f32, SETTLED_PLAIN_PX);
             // The brightest place may be a glint beside the line: it is not where the colour is.
             let largest_px = OFF_COLOUR_PX.max(OFF_COLOUR_WIDTHS * width_px);
             let spot = spot.filter(|spot| (first as f32 + spot.at - start.expected_px).abs() <= largest_px);
@@ -182,7 +185,8 @@ impl Seen {
             .step_by(4)
             .filter(found)
             .filter_map(|position| {
-                self.shape.width_px(self.profile(position), self.stripe.across_px[position] - self.starts[position] as f32)
+                self.shape
+                    .width_px(self.profile(position), self.stripe.across_px[position] - self.starts[position] as f32)
             })
             .collect();
         let middle = widths.len() / 2;
@@ -249,9 +253,9 @@ fn line_around(chosen: &[Option<Candidate>]) -> Vec<Option<f32>> {
                 return Some(before.1 + share * (after.1 - before.1));
             }
             near.clear();
-            near.extend((from..to).filter_map(place));
+            near.extend((from..to).step_by(2).filter_map(place));
             let middle = near.len() / 2;
-            (near.len() > LINE_REACH / 2).then(|| *near.select_nth_unstable_by(middle, f32::total_cmp).1)
+            (near.len() > LINE_REACH / 4).then(|| *near.select_nth_unstable_by(middle, f32::total_cmp).1)
         })
         .collect()
 }
@@ -282,7 +286,7 @@ fn divide_by_wall(seen: &Seen, wall: &Wall<'_>, stripe: &mut Stripe) {
         if !seen.shape.divide(seen.profile(position), pattern, &mut divided) {
             continue;
         }
-        if let Some(spot) = seen.shape.find(&divided, Background::None, start)
+        if let Some(spot) = seen.shape.find(&divided, Background::None, start, SETTLED_PX)
             && (spot.at - start).abs() < 0.5 * seen.shape.width_px
         {
             stripe.across_px[position] = seen.starts[position] as f32 + spot.at;
@@ -327,14 +331,14 @@ impl<'a> Lines<'a> {
 
     /// The same between pixels; all NaN where it is not inside the image.
     fn read_between(&self, along: f32, first: f32, light: &[f32; 256], out: &mut [f32]) {
-        let (row, column) = (along.floor(), first.floor());
-        let inside = row >= 0.0 && column >= 0.0;
-        if !inside || row as usize + 1 >= self.positions || column as usize + out.len() + 1 >= self.length {
+        let inside = along >= 0.0 && first >= 0.0;
+        let (row, column) = (along as usize, first as usize);
+        if !inside || row + 1 >= self.positions || column + out.len() + 1 >= self.length {
             out.fill(f32::NAN);
             return;
         }
-        let (share_along, share_across) = (along - row, first - column);
-        let at = row as usize * self.along + column as usize * self.across;
+        let (share_along, share_across) = (along - row as f32, first - column as f32);
+        let at = row * self.along + column * self.across;
         let (near, far) = (&self.plane.data[at..], &self.plane.data[at + self.along..]);
         let value = |i: usize| {
             let (a, b) = (light[usize::from(near[i * self.across])], light[usize::from(far[i * self.across])]);

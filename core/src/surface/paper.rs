@@ -142,8 +142,7 @@ impl<T> Placement<T> {
         }
         let jitter_mm = first.measured.profile.median_z_mm().map_or(0.0, |z_mm| z_mm * (depth_factor - 1.0));
         let position_mm = first.position_mm + Vector3::z() * jitter_mm;
-        let strip =
-            StripPlace { travel_px: first.travel_px, travel_end_px, across_px: first.across_px, depth_factor };
+        let strip = StripPlace { travel_px: first.travel_px, travel_end_px, across_px: first.across_px, depth_factor };
         Some(Placed {
             world_from_camera: Some(starting_pose(self.line, position_mm)),
             degrees_of_freedom: 3,

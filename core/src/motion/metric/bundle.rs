@@ -204,14 +204,7 @@ impl Equations {
         equations
     }
 
-    fn add(
-        &mut self,
-        view: Option<usize>,
-        by_move: &Vector6<f64>,
-        by_place: &Vector3<f64>,
-        weight: f64,
-        miss: f64,
-    ) {
+    fn add(&mut self, view: Option<usize>, by_move: &Vector6<f64>, by_place: &Vector3<f64>, weight: f64, miss: f64) {
         self.own += weight * by_place * by_place.transpose();
         self.right += weight * miss * by_place;
         let Some(view) = view else { return };

@@ -8,7 +8,7 @@ use super::patch::{Found, Kept, Patch, REACH, SIDE, Stretch, UPRIGHT};
 use crate::rig::Camera;
 
 /// A patch is made anew when the view turns or stretches it by more than this.
-const STRETCH_STEP: f32 = 0.006;
+const STRETCH_STEP: f32 = 0.012;
 /// Least standard deviation of a place found by a landmark's recent look: errors of one frame add to the next one's.
 const RECENT_SIGMA_PX: f32 = 0.25;
 /// Side of the blocks whose texture is summed, px of the shrunk image.

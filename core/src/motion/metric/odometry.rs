@@ -298,13 +298,7 @@ impl Odometry {
     }
 
     /// Lost: wait for the wall to come back; after a while take the way to be broken and begin anew where it was lost.
-    fn miss(
-        &mut self,
-        view: &View3<'_>,
-        profile: &Profile,
-        rows: Vec<Option<Point3<f64>>>,
-        mut last: Last,
-    ) -> Motion {
+    fn miss(&mut self, view: &View3<'_>, profile: &Profile, rows: Vec<Option<Point3<f64>>>, mut last: Last) -> Motion {
         self.lost += 1;
         // At the very start of a part nothing is lost with it.
         let lost_max = if self.keyframes.len() < 2 { 0 } else { self.options.lost_max };
@@ -458,7 +452,12 @@ impl Odometry {
         let covariance = rotation.matrix() * landmark.covariance * rotation.matrix().transpose();
         let own: f64 = by_point.iter().map(|row| Vector3::from(*row)).map(|row| row.dot(&(covariance * row))).sum();
         let sigma = sigma_px / camera.fx_px;
-        Some(Sight { landmark: id, world: landmark.world, ray: [ray.x, ray.y], sigma: (sigma * sigma + own / 2.0).sqrt() })
+        Some(Sight {
+            landmark: id,
+            world: landmark.world,
+            ray: [ray.x, ray.y],
+            sigma: (sigma * sigma + own / 2.0).sqrt(),
+        })
     }
 
     /// Finds the landmarks near where the pose puts them, or where `places` says, and solves the pose.
@@ -498,7 +497,12 @@ impl Odometry {
             }
         }
         if std::env::var("STRIA_DBG").is_ok() {
-            eprintln!("frame {} sights {} of {}", view.frame, sights.len(), self.landmarks.values().filter(|l| !l.dead).count());
+            eprintln!(
+                "frame {} sights {} of {}",
+                view.frame,
+                sights.len(),
+                self.landmarks.values().filter(|l| !l.dead).count()
+            );
         }
         if sights.len() < FEWEST_SIGHTS {
             return None;
@@ -525,7 +529,12 @@ impl Odometry {
             good.push(sight);
         }
         if std::env::var("STRIA_DBG").is_ok() {
-            eprintln!("   good {} dof {} moved {:.4?}", good.len(), degrees_of_freedom, pose::difference(start, &pose).as_slice());
+            eprintln!(
+                "   good {} dof {} moved {:.4?}",
+                good.len(),
+                degrees_of_freedom,
+                pose::difference(start, &pose).as_slice()
+            );
         }
         (good.len() >= FEWEST_SIGHTS).then_some(Followed { pose, sights: good, places, degrees_of_freedom })
     }
@@ -628,7 +637,15 @@ impl Odometry {
             let d = pose::difference(&before.unwrap(), &views.last().unwrap().camera_from_world);
             let c = bundle::total_cost(&views, &places);
             let n: usize = places.iter().map(|p| p.sights.len()).sum();
-            eprintln!("BA kf {} free {} places {} obs {} cost/obs {:.3} moved {:.4?}", views.len(), views.iter().filter(|v| v.free).count(), places.len(), n, c / n as f64, d.as_slice());
+            eprintln!(
+                "BA kf {} free {} places {} obs {} cost/obs {:.3} moved {:.4?}",
+                views.len(),
+                views.iter().filter(|v| v.free).count(),
+                places.len(),
+                n,
+                c / n as f64,
+                d.as_slice()
+            );
         }
         for (keyframe, view) in self.keyframes.iter_mut().zip(views) {
             keyframe.camera_from_world = view.camera_from_world;
@@ -690,8 +707,7 @@ impl Odometry {
             landmark.covariance = direction * direction.transpose() * (sigma_mm * sigma_mm)
                 + Matrix3::identity() * (sight_sigma * z_mm).powi(2);
             landmark.sights.push((number, PlaceSight { view: 0, ray, sigma: sight_sigma }));
-            let depth =
-                PlaceDepth { guess: true, view: 0, direction: Vector3::z(), distance_mm: z_mm, sigma_mm };
+            let depth = PlaceDepth { guess: true, view: 0, direction: Vector3::z(), distance_mm: z_mm, sigma_mm };
             landmark.depths.push((number, depth));
             landmark.last_frame = view.frame;
             self.landmarks.insert(self.next_landmark, landmark);

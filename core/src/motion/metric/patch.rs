@@ -15,7 +15,7 @@ const PIXELS: usize = SIDE * SIDE;
 /// Rounds, at most.
 const ROUNDS: usize = 12;
 /// It is found when it moves less than this, px.
-const FOUND_PX: f32 = 0.01;
+const FOUND_PX: f32 = 0.03;
 /// A patch whose brightness changes by less than this (standard deviation, levels) cannot be followed.
 const LEAST_CONTRAST: f32 = 1.0;
 
@@ -58,7 +58,8 @@ impl Kept {
         for row in 0..WIDE {
             for column in 0..WIDE {
                 let (x, y) = (column as f32 - REACH as f32, row as f32 - REACH as f32);
-                let (kept_x, kept_y) = (back[0][0] * x + back[0][1] * y + middle, back[1][0] * x + back[1][1] * y + middle);
+                let (kept_x, kept_y) =
+                    (back[0][0] * x + back[0][1] * y + middle, back[1][0] * x + back[1][1] * y + middle);
                 if !(kept_x >= 0.0 && kept_y >= 0.0 && kept_x < (KEPT - 1) as f32 && kept_y < (KEPT - 1) as f32) {
                     return None;
                 }
@@ -83,6 +84,8 @@ pub(super) struct Patch {
     slope_y: Box<[f32; PIXELS]>,
     /// Inverse of the slopes' normal matrix: xx, xy, yy.
     inverse: [f32; 3],
+    /// The values' moments with the slopes.
+    own: (f32, f32),
 }
 
 /// Where a patch was found.
@@ -124,11 +127,14 @@ impl Patch {
             }
         }
         let det = xx * yy - xy * xy;
+        let moment = |slope: &[f32; PIXELS]| values.iter().zip(slope).map(|(v, s)| v * s).sum::<f32>();
+        let own = (moment(&slope_x), moment(&slope_y));
         (det > 1e-6 * (xx + yy) * (xx + yy)).then(|| Patch {
             values,
             slope_x,
             slope_y,
             inverse: [yy / det, -xy / det, xx / det],
+            own,
         })
     }
 
@@ -159,7 +165,7 @@ impl Patch {
                 return None;
             }
             let step = dx.hypot(dy);
-            if step < FOUND_PX || (step < 0.05 && step > 0.7 * last) {
+            if step < FOUND_PX || (step < 0.1 && step > 0.7 * last) {
                 let rest = (1.0 - like).max(0.0) * 2.0;
                 let [xx, _, yy] = self.inverse;
                 // What does not fit is alike over some pixels: fewer of them count.
@@ -215,15 +221,10 @@ impl Patch {
             return None;
         }
         // The error is (seen − mean)/deviation − values; the values' own part of the moment is known beforehand.
-        let (own_x, own_y) = self.own_moments();
+        let (own_x, own_y) = self.own;
         let (moment_x, moment_y) = (total(moment_x) / deviation - own_x, total(moment_y) / deviation - own_y);
         let [xx, xy, yy] = self.inverse;
         let like = total(product) / (deviation * PIXELS as f32);
         Some((like, (xx * moment_x + xy * moment_y, xy * moment_x + yy * moment_y)))
-    }
-
-    fn own_moments(&self) -> (f32, f32) {
-        let moment = |slope: &[f32]| self.values.iter().zip(slope).map(|(v, s)| v * s).sum::<f32>();
-        (moment(&*self.slope_x), moment(&*self.slope_y))
     }
 }

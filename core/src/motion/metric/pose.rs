@@ -49,10 +49,8 @@ pub(super) fn projection(p: &Point3<f64>) -> Option<(Vector2<f64>, [[f64; 6]; 2]
     let (x, y) = (p.x * inverse, p.y * inverse);
     let by_point = [[inverse, 0.0, -x * inverse], [0.0, inverse, -y * inverse]];
     // The point moves by ω × p + t.
-    let by_move = [
-        [-x * y, 1.0 + x * x, -y, inverse, 0.0, -x * inverse],
-        [-(1.0 + y * y), x * y, x, 0.0, inverse, -y * inverse],
-    ];
+    let by_move =
+        [[-x * y, 1.0 + x * x, -y, inverse, 0.0, -x * inverse], [-(1.0 + y * y), x * y, x, 0.0, inverse, -y * inverse]];
     Some((Vector2::new(x, y), by_move, by_point))
 }
 

@@ -13,19 +13,27 @@ pub(super) const GROUP: usize = 4;
 const CELL_PX: usize = 2;
 /// Half widths of the ridges that are looked for, cells: a fine line, and one whose clipped core has lost its colour.
 const HALF_WIDTHS: [usize; 2] = [2, 5];
+/// Above this width, px, a line is a wide one.
+const WIDE_PX: f32 = 14.0;
 /// Peaks closer than this are one, cells.
 const PEAK_DISTANCE: usize = 6;
 /// Candidates of one group, at most: the strongest.
 const MAX_CANDIDATES: usize = 8;
 
 /// The ridges of each group of [`GROUP`] line positions, across the line in luma px; their contrast is the mean
-/// difference in chroma levels.
+/// difference in chroma levels. `width_px` is the line's width where it is known.
 pub(super) fn ridges(
     image: Yuv<'_>,
     colour: LaserColour,
     line: LineDirection,
+    width_px: Option<f32>,
     least: f32,
 ) -> Vec<Vec<Candidate>> {
+    let half_widths = match width_px {
+        None => &HALF_WIDTHS[..],
+        Some(width) if width < WIDE_PX => &HALF_WIDTHS[..1],
+        Some(_) => &HALF_WIDTHS[1..],
+    };
     let field = Field::of(image, colour, line);
     let mut prefix = vec![0i32; field.cells + 1];
     let mut response = vec![0.0f32; field.cells];
@@ -39,7 +47,7 @@ pub(super) fn ridges(
                 *to = sum;
             }
             response.fill(0.0);
-            HALF_WIDTHS.iter().for_each(|half| ridge_response(&prefix, *half, scale, &mut response));
+            half_widths.iter().for_each(|half| ridge_response(&prefix, *half, scale, &mut response));
             peaks(&response, least, row, &prefix)
         })
         .collect()
@@ -147,8 +155,7 @@ impl Field {
                 let r = row * cell_y + k;
                 let u_row = &u.data[r * u.stride_bytes..][..columns * cell_x];
                 let v_row = &v.data[r * v.stride_bytes..][..columns * cell_x];
-                let value =
-                    |u: &u8, v: &u8| weight_u * (i16::from(*u) - 128) + weight_v * (i16::from(*v) - 128);
+                let value = |u: &u8, v: &u8| weight_u * (i16::from(*u) - 128) + weight_v * (i16::from(*v) - 128);
                 if cell_x == 1 {
                     for ((sum, u), v) in line_sum.iter_mut().zip(u_row).zip(v_row) {
                         *sum += value(u, v);

@@ -6,8 +6,10 @@ const WINDOW_SHARE: f32 = 0.38;
 const SIDE: usize = 4;
 /// Rounds of the centroid, at most; it settles in four.
 const ROUNDS: usize = 8;
-/// It has settled when it moves less than this, px.
-const SETTLED_PX: f32 = 0.003;
+/// The window ends this many of its standard deviations from its middle.
+const WINDOW_REACH: f32 = 2.83;
+/// Sums are kept apart for so many samples side by side, for the processor to take them at once.
+const LANES: usize = 8;
 /// Error of a pixel's light as a share of the line's light there: the wall's pattern and speckle.
 const PATTERN_SHARE: f32 = 0.08;
 /// Error of a pixel's light that is always there: noise and the encoder.
@@ -54,55 +56,84 @@ impl SpotShape {
         2 * self.half + 1
     }
 
-    /// The centroid under a Gaussian window that moves with it. `None` where there is no light or it runs away.
-    pub(super) fn find(&self, profile: &[f32], background: Background, start: f32) -> Option<Spot> {
+    /// The centroid under a bell-shaped window that moves with it, to `settled_px`. `None` where there is no light or it
+    /// runs away.
+    pub(super) fn find(&self, profile: &[f32], background: Background, start: f32, settled_px: f32) -> Option<Spot> {
         let (left, right) = match background {
             Background::Sides => (side(&profile[..SIDE]), side(&profile[profile.len() - SIDE..])),
             Background::None => (0.0, 0.0),
         };
-        // The sides' middles are `SIDE - 1` samples further apart than the profile is long without them.
-        let span = (profile.len() - SIDE) as f32;
-        let offset = (SIDE as f32 - 1.0) / 2.0;
-        let slope = (right - left) / span;
-        let lit = |i: usize, value: f32| value - (left + slope * (i as f32 - offset));
-        let s = WINDOW_SHARE * self.width_px;
-        let reach = 3.0 * s;
+        // The sides' middles are `SIDE` samples less apart than the profile is long.
+        let slope = (right - left) / (profile.len() - SIDE) as f32;
+        let level = left - slope * (SIDE as f32 - 1.0) / 2.0;
         let mut at = start;
         for _ in 0..ROUNDS {
-            let (first, last) = self.window(at, reach)?;
-            let mut weights = Window::new(first as f32 - at, s);
-            let (mut sum, mut moment) = (0.0, 0.0);
-            for (i, value) in profile[first..=last].iter().enumerate() {
-                let q = weights.next() * lit(first + i, *value);
-                sum += q;
-                moment += q * (first as f32 + i as f32 - at);
-            }
-            if sum <= 1e-5 {
+            let sums = self.sums(profile, at, level, slope, false)?;
+            if sums.light <= 1e-5 {
                 return None;
             }
-            let step = (2.0 * moment / sum).clamp(-0.5 * self.width_px, 0.5 * self.width_px);
+            // Under a window as wide as the line the centroid goes half the way.
+            let step = (2.0 * sums.moment / sums.light).clamp(-0.5 * self.width_px, 0.5 * self.width_px);
             at += step;
-            if step.abs() < SETTLED_PX {
+            if step.abs() < settled_px {
                 break;
             }
         }
-        let (first, last) = self.window(at, reach)?;
-        let mut weights = Window::new(first as f32 - at, s);
-        let (mut sum, mut variance, mut height) = (0.0, 0.0, 0.0_f32);
-        for (i, value) in profile[first..=last].iter().enumerate() {
-            let (weight, q) = (weights.next(), lit(first + i, *value));
-            let off = first as f32 + i as f32 - at;
-            let error = NOISE_LIGHT * NOISE_LIGHT + PATTERN_SHARE * PATTERN_SHARE * q * q;
-            sum += weight * q;
-            variance += (weight * off) * (weight * off) * error;
-            height = height.max(q);
-        }
+        let sums = self.sums(profile, at, level, slope, true)?;
         let middle = (profile.len() / 2) as f32;
-        (sum > 1e-5 && (at - middle).abs() < self.half as f32 - SIDE as f32).then(|| Spot {
+        (sums.light > 1e-5 && (at - middle).abs() < self.half as f32 - SIDE as f32).then(|| Spot {
             at,
-            sigma: 2.0 * variance.sqrt() / sum + self.glare_px(left, right, height),
-            height,
+            sigma: 2.0 * sums.variance.sqrt() / sums.light + self.glare_px(left, right, sums.height),
+            height: sums.height,
             background: (left + right) / 2.0,
+        })
+    }
+
+    /// Sums over the window around a place: light above a slope, and what else is asked for.
+    #[inline]
+    fn sums(&self, profile: &[f32], at: f32, level: f32, slope: f32, all: bool) -> Option<Sums> {
+        let reach = WINDOW_REACH * WINDOW_SHARE * self.width_px;
+        if !(at > -reach && at < profile.len() as f32 + reach) {
+            return None;
+        }
+        // Whole lanes: beyond the window's end the weight is nothing.
+        let lanes = ((2.0 * reach) as usize + 1) / LANES + 1;
+        let from = ((at - reach).max(0.0) as usize).min(profile.len().checked_sub(lanes * LANES)?);
+        let window = &profile[from..from + lanes * LANES];
+        let scale = 1.0 / (reach * reach);
+        let (mut light, mut moment) = ([0.0f32; LANES], [0.0f32; LANES]);
+        let (mut variance, mut height) = ([0.0f32; LANES], [0.0f32; LANES]);
+        for (k, chunk) in window.chunks_exact(LANES).enumerate() {
+            let base = (from + k * LANES) as f32;
+            for lane in 0..LANES {
+                let x = base + lane as f32;
+                let d = x - at;
+                // (1 − (d/reach)²)⁴ is nearly the bell exp(−4·(d/reach)²), and needs no exponential.
+                let u = (1.0 - d * d * scale).max(0.0);
+                let weight = u * u * (u * u);
+                let weighted = weight * (chunk[lane] - level - slope * x);
+                light[lane] += weighted;
+                moment[lane] += weighted * d;
+            }
+            if all {
+                for lane in 0..LANES {
+                    let x = base + lane as f32;
+                    let d = x - at;
+                    let u = (1.0 - d * d * scale).max(0.0);
+                    let weight = u * u * (u * u);
+                    let q = chunk[lane] - level - slope * x;
+                    let error = NOISE_LIGHT * NOISE_LIGHT + PATTERN_SHARE * PATTERN_SHARE * q * q;
+                    variance[lane] += weight * weight * d * d * error;
+                    height[lane] = height[lane].max(if u > 0.0 { q } else { 0.0 });
+                }
+            }
+        }
+        let total = |part: &[f32; LANES]| part.iter().sum::<f32>();
+        Some(Sums {
+            light: total(&light),
+            moment: total(&moment),
+            variance: total(&variance),
+            height: height.iter().copied().fold(0.0, f32::max),
         })
     }
 
@@ -110,13 +141,6 @@ impl SpotShape {
     fn glare_px(&self, left: f32, right: f32, height: f32) -> f32 {
         let lopsided = (left - right).abs() / height.max(1e-3);
         GLARE * self.width_px * lopsided * lopsided
-    }
-
-    fn window(&self, at: f32, reach: f32) -> Option<(usize, usize)> {
-        let last = self.samples() - 1;
-        let first = (at - reach).ceil().max(0.0);
-        let end = (at + reach).floor().min(last as f32);
-        (at.is_finite() && first < end).then_some((first as usize, end as usize))
     }
 
     /// Width at half height around a centre, px.
@@ -162,26 +186,12 @@ fn side(samples: &[f32]) -> f32 {
     (samples.iter().sum::<f32>() - low - high) / (samples.len() - 2) as f32
 }
 
-/// exp(−d²/2s²) for d, d + 1, …: two multiplications a value.
-struct Window {
-    value: f32,
-    ratio: f32,
-    ratio_step: f32,
-}
-
-impl Window {
-    fn new(d: f32, s: f32) -> Window {
-        let k = 1.0 / (2.0 * s * s);
-        Window { value: (-d * d * k).exp(), ratio: (-(2.0 * d + 1.0) * k).exp(), ratio_step: (-2.0 * k).exp() }
-    }
-
-    #[inline]
-    fn next(&mut self) -> f32 {
-        let value = self.value;
-        self.value *= self.ratio;
-        self.ratio *= self.ratio_step;
-        value
-    }
+/// Sums over a window.
+struct Sums {
+    light: f32,
+    moment: f32,
+    variance: f32,
+    height: f32,
 }
 
 /// Softens the wall's pattern, `samples` a line position, over its neighbours in both directions ([1 2 1] twice): what
