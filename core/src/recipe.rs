@@ -155,7 +155,7 @@ recipe! {
         /// smoother; a very rough wall wants more.
         bend_px: f64 = 0.002, "px a row", number(0.00001, 1.0);
         /// Rows that are less sure than this are left out.
-        sigma_max_px: f64 = 2.0, "px", number(0.01, 100.0);
+        sigma_max_px: f64 = 1.0, "px", number(0.01, 100.0);
     }
     /// How the camera's pose is found (method `metric`).
     pose: PoseOptions {

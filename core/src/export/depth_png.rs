@@ -53,7 +53,7 @@ fn write_part(map: &mut dyn MapReader, path: &Path, part: &Part, scale: Option<G
     let mut encoder = Encoder::new(&mut file, part.width_px as u32, geometry.height_px as u32);
     encoder.set_color(ColorType::Grayscale);
     encoder.set_depth(BitDepth::Sixteen);
-    encoder.set_compression(Compression::Balanced);
+    encoder.set_compression(Compression::Fast);
     encoder.set_pixel_dims(pixels_per_metre(geometry.mm_per_px));
     for (key, value) in texts(&geometry, part, scale) {
         encoder.add_text_chunk(key.into(), value).map_err(refused)?;

@@ -11,7 +11,7 @@ use crate::depth_map::sheet::WallColours;
 use crate::error::Result;
 use crate::motion::metric::{Odometry, SettledPose};
 use crate::source::Source;
-use crate::stripe::metric::{StripeFinder, measure_stripe};
+use crate::stripe::metric::stripe_stages;
 use crate::surface::{Measured, Placed};
 use crate::triangulation::triangulate;
 
@@ -28,7 +28,7 @@ pub(super) fn measure(run: &mut Run<'_, '_, '_, '_>, source: Box<dyn Source>) ->
     let mut colours = ColourFinder::new(!between);
     std::thread::scope(|scope| {
         // Source ▶ Frame ▶ the line as the frame alone shows it, in a thread of their own.
-        let mut finder = StripeFinder::new(&rig.laser, &recipe.spot);
+        let (mut finder, mut measurer) = stripe_stages(&rig.laser, &recipe.spot);
         let (frames, reading) =
             reading::start(scope, source, rig, recipe, move |frame| Ok(finder.see(frame.image.yuv())));
         for seen in frames {
@@ -42,9 +42,7 @@ pub(super) fn measure(run: &mut Run<'_, '_, '_, '_>, source: Box<dyn Source>) ->
             let positions = found.stripe.across_px.len();
             let pose = motion.camera_from_world;
             let wall = pose.and_then(|pose| recent.wall(rig, &plain, &pose, positions, found.reach_px()));
-            let stripe = run
-                .timings
-                .time("stripe", || measure_stripe(&found, wall.as_ref().map(|(_, wall)| wall), &recipe.spot));
+            let stripe = run.timings.time("stripe", || measurer.measure(found, wall.as_ref().map(|(_, wall)| wall)));
             let profile = run.timings.time("triangulation", || triangulate(&stripe, rig));
             run.products.stripe(&stripe)?;
             let moved_px = motion.shift.dx_px.unwrap_or(0.0).hypot(motion.shift.dy_px.unwrap_or(0.0));
@@ -58,11 +56,11 @@ pub(super) fn measure(run: &mut Run<'_, '_, '_, '_>, source: Box<dyn Source>) ->
             }
             let cargo = Cargo { stripe, colours: Colours::Unknown, picture };
             let measured = Measured { frame: frame.index, time_s: frame.time_s, profile, shift: motion.shift, cargo };
-            waiting.push(measured);
             match pose {
-                Some(pose) => recent.push(moved_px, || Recent::new(image, pose, &found.stripe)),
+                Some(pose) => recent.push(moved_px, || Recent::new(image, pose, &measured.cargo.stripe)),
                 None => recent.clear(),
             }
+            waiting.push(measured);
             if let Some(newest) = recent.newest() {
                 run.timings.time("texture", || colours.add_late(rig, newest));
             }

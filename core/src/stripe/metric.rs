@@ -18,6 +18,8 @@ mod evidence;
 mod smoothing;
 mod spot;
 
+use std::sync::mpsc::{Receiver, Sender, channel};
+
 use crate::recipe::SpotOptions;
 use crate::rig::{Laser, LineDirection};
 use crate::source::{PlaneView, Yuv};
@@ -45,6 +47,8 @@ const LINE_REACH: usize = 10;
 /// A centre has settled when it moves less than this, px: before the wall's pattern is taken out, and after.
 const SETTLED_PLAIN_PX: f32 = 0.02;
 const SETTLED_PX: f32 = 0.005;
+/// The line goes on from one row to the next where the row before lies this near to where the colour is, px.
+const GOES_ON_PX: f32 = 2.5;
 /// Two candidates closer than this are one, px.
 const SAME_START_PX: f32 = 3.0;
 
@@ -53,6 +57,31 @@ pub struct StripeFinder {
     laser: Laser,
     options: SpotOptions,
     width_px: Option<f32>,
+    scratch: evidence::Scratch,
+    /// Memory of profiles that were measured, to be used again: a frame's take a third of a megabyte.
+    spare: Receiver<Vec<f32>>,
+}
+
+/// Measures what a [`StripeFinder`] has seen, in another thread.
+pub struct StripeMeasurer {
+    options: SpotOptions,
+    pattern: Vec<f32>,
+    divided: Vec<f32>,
+    spare: Sender<Vec<f32>>,
+}
+
+/// A finder and a measurer that belong together.
+pub fn stripe_stages(laser: &Laser, options: &SpotOptions) -> (StripeFinder, StripeMeasurer) {
+    let (give, take) = channel();
+    let finder = StripeFinder {
+        laser: laser.clone(),
+        options: options.clone(),
+        width_px: None,
+        scratch: evidence::Scratch::default(),
+        spare: take,
+    };
+    let measurer = StripeMeasurer { options: options.clone(), pattern: Vec::new(), divided: Vec::new(), spare: give };
+    (finder, measurer)
 }
 
 /// The line as one frame shows it, before the wall's own pattern is taken out.
@@ -76,15 +105,11 @@ pub struct Wall<'a> {
 }
 
 impl StripeFinder {
-    /// A finder that has seen nothing.
-    pub fn new(laser: &Laser, options: &SpotOptions) -> StripeFinder {
-        StripeFinder { laser: laser.clone(), options: options.clone(), width_px: None }
-    }
-
     /// Finds the line in a frame.
     pub fn see(&mut self, image: Yuv<'_>) -> Seen {
         let least = self.options.evidence_min as f32;
-        let mut candidates = evidence::ridges(image, self.laser.colour, self.laser.line, self.width_px, least);
+        let mut candidates =
+            evidence::ridges(image, self.laser.colour, self.laser.line, self.width_px, least, &mut self.scratch);
         // The choice counts in steps from row to row: here a row is a group of them.
         let group = GROUP as f32;
         candidates.iter_mut().flatten().for_each(|c| c.across_px /= group);
@@ -113,14 +138,24 @@ impl StripeFinder {
         let (positions, samples) = (luma.positions, shape.samples());
         let mut seen = Seen {
             stripe: Stripe::empty(self.laser.line, positions),
-            light: vec![0.0; positions * samples],
+            light: self.spare.try_recv().unwrap_or_default(),
             starts: vec![0; positions],
             shape,
         };
+        seen.light.resize(positions * samples, 0.0);
         let contrast_min = self.options.contrast_min as f32 / 255.0;
         let line = line_around(chosen);
         for position in 0..positions {
-            let Some(start) = strongest_start(luma, light, chosen, &line, position, width_px) else { continue };
+            // Mostly the line goes on from the row before; where it may not, look for the most light.
+            let expected_px = chosen.get(position / GROUP).copied().flatten().map(|c| c.across_px);
+            let before_px = position.checked_sub(1).map_or(f32::NAN, |before| seen.stripe.across_px[before]);
+            let start = match expected_px {
+                Some(expected_px) if (before_px - expected_px).abs() < GOES_ON_PX => {
+                    Some(Start { expected_px, centre: before_px.round() as i32, coloured: true })
+                }
+                _ => strongest_start(luma, light, chosen, &line, position, width_px),
+            };
+            let Some(start) = start else { continue };
             let first = start.centre - seen.shape.half as i32;
             if first < 0 || first as usize + samples > luma.length {
                 continue;
@@ -149,14 +184,58 @@ impl StripeFinder {
     }
 }
 
-/// The stripe with all that is known: the wall without the laser where another frame saw it, and smoothed along the line.
-pub fn measure_stripe(seen: &Seen, wall: Option<&Wall<'_>>, options: &SpotOptions) -> Stripe {
-    let mut stripe = seen.stripe.clone();
-    if let Some(wall) = wall.filter(|_| options.wall_reference) {
-        divide_by_wall(seen, wall, &mut stripe);
+impl StripeMeasurer {
+    /// The stripe with all that is known: the wall without the laser where another frame saw it, and smoothed along the
+    /// line.
+    pub fn measure(&mut self, seen: Seen, wall: Option<&Wall<'_>>) -> Stripe {
+        let mut stripe = seen.stripe.clone();
+        if let Some(wall) = wall.filter(|_| self.options.wall_reference) {
+            self.divide_by_wall(&seen, wall, &mut stripe);
+        }
+        smoothing::smooth(&mut stripe, &self.options);
+        // The finder may have ended: then nobody needs it.
+        let _ = self.spare.send(seen.light);
+        stripe
     }
-    smoothing::smooth(&mut stripe, options);
-    stripe
+
+    /// Measures each spot again on the light divided by the wall's own pattern.
+    fn divide_by_wall(&mut self, seen: &Seen, wall: &Wall<'_>, stripe: &mut Stripe) {
+        let luma = Lines::of(wall.image, stripe.line);
+        let table = wall.image.light();
+        let samples = seen.samples();
+        let positions = seen.starts.len();
+        let pattern = &mut self.pattern;
+        pattern.resize(positions * samples, f32::NAN);
+        for (position, out) in pattern.chunks_exact_mut(samples).enumerate() {
+            let (Some(Some((across, along))), true) =
+                (wall.places.get(position), stripe.across_px[position].is_finite())
+            else {
+                out[0] = f32::NAN;
+                continue;
+            };
+            let offset = seen.starts[position] as f32 - stripe.across_px[position];
+            luma.read_between(*along, across + offset, table, out);
+        }
+        spot::soften(pattern, samples);
+        self.divided.resize(samples, 0.0);
+        for position in 0..positions {
+            let pattern = &pattern[position * samples..][..samples];
+            if !stripe.across_px[position].is_finite() || !pattern[0].is_finite() {
+                continue;
+            }
+            let start = stripe.across_px[position] - seen.starts[position] as f32;
+            if !seen.shape.divide(seen.profile(position), pattern, &mut self.divided) {
+                continue;
+            }
+            if let Some(spot) = seen.shape.find(&self.divided, Background::None, start, SETTLED_PX)
+                && (spot.at - start).abs() < 0.5 * seen.shape.width_px
+            {
+                stripe.across_px[position] = seen.starts[position] as f32 + spot.at;
+                // The pattern was most of the error: half of it is gone (measured on simulated concrete).
+                stripe.sigma_px[position] *= 0.6;
+            }
+        }
+    }
 }
 
 impl Seen {
@@ -258,42 +337,6 @@ fn line_around(chosen: &[Option<Candidate>]) -> Vec<Option<f32>> {
             (near.len() > LINE_REACH / 4).then(|| *near.select_nth_unstable_by(middle, f32::total_cmp).1)
         })
         .collect()
-}
-
-/// Measures each spot again on the light divided by the wall's own pattern.
-fn divide_by_wall(seen: &Seen, wall: &Wall<'_>, stripe: &mut Stripe) {
-    let luma = Lines::of(wall.image, stripe.line);
-    let table = wall.image.light();
-    let samples = seen.samples();
-    let positions = seen.starts.len();
-    let mut pattern = vec![f32::NAN; positions * samples];
-    for (position, out) in pattern.chunks_exact_mut(samples).enumerate() {
-        let (Some(Some((across, along))), true) = (wall.places.get(position), stripe.across_px[position].is_finite())
-        else {
-            continue;
-        };
-        let offset = seen.starts[position] as f32 - stripe.across_px[position];
-        luma.read_between(*along, across + offset, table, out);
-    }
-    spot::soften(&mut pattern, samples);
-    let mut divided = vec![0.0; samples];
-    for position in 0..positions {
-        let pattern = &pattern[position * samples..][..samples];
-        if !stripe.across_px[position].is_finite() || !pattern[0].is_finite() {
-            continue;
-        }
-        let start = stripe.across_px[position] - seen.starts[position] as f32;
-        if !seen.shape.divide(seen.profile(position), pattern, &mut divided) {
-            continue;
-        }
-        if let Some(spot) = seen.shape.find(&divided, Background::None, start, SETTLED_PX)
-            && (spot.at - start).abs() < 0.5 * seen.shape.width_px
-        {
-            stripe.across_px[position] = seen.starts[position] as f32 + spot.at;
-            // The pattern was most of the error: half of it is gone (measured on simulated concrete).
-            stripe.sigma_px[position] *= 0.6;
-        }
-    }
 }
 
 /// The luma as lines across the laser line: one per line position.

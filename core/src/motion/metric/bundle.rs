@@ -88,7 +88,7 @@ pub(super) fn adjust(views: &mut [View], places: &mut [Place], rounds: usize) {
 }
 
 /// What all sights and depths are off by: squares for small errors, straight for large ones (Huber).
-pub(super) fn total_cost(views: &[View], places: &[Place]) -> f64 {
+fn total_cost(views: &[View], places: &[Place]) -> f64 {
     let huber = |size: f64| if size > HUBER { HUBER * (2.0 * size - HUBER) } else { size * size };
     let of_place = |place: &Place| {
         let sights = place.sights.iter().map(|sight| {
@@ -181,7 +181,7 @@ impl Equations {
             let p = pose * place.world;
             let Some((seen, by_move, by_point)) = projection(&p) else { continue };
             let miss = [sight.ray[0] - seen.x, sight.ray[1] - seen.y];
-            let size = miss[0].hypot(miss[1]) / sight.sigma;
+            let size = (miss[0] * miss[0] + miss[1] * miss[1]).sqrt() / sight.sigma;
             let weight = robust(size) / (sight.sigma * sight.sigma);
             let rotation = pose.rotation.to_rotation_matrix();
             for (axis, miss) in miss.into_iter().enumerate() {

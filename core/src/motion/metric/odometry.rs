@@ -496,14 +496,6 @@ impl Odometry {
                 seen.push((found.x, found.y));
             }
         }
-        if std::env::var("STRIA_DBG").is_ok() {
-            eprintln!(
-                "frame {} sights {} of {}",
-                view.frame,
-                sights.len(),
-                self.landmarks.values().filter(|l| !l.dead).count()
-            );
-        }
         if sights.len() < FEWEST_SIGHTS {
             return None;
         }
@@ -527,14 +519,6 @@ impl Odometry {
             landmark.remember(view.gray, at);
             places.insert(sight.landmark, at);
             good.push(sight);
-        }
-        if std::env::var("STRIA_DBG").is_ok() {
-            eprintln!(
-                "   good {} dof {} moved {:.4?}",
-                good.len(),
-                degrees_of_freedom,
-                pose::difference(start, &pose).as_slice()
-            );
         }
         (good.len() >= FEWEST_SIGHTS).then_some(Followed { pose, sights: good, places, degrees_of_freedom })
     }
@@ -630,23 +614,7 @@ impl Odometry {
                 covariance: landmark.covariance,
             });
         }
-        let dbg = std::env::var("STRIA_DBG").is_ok();
-        let before = views.last().map(|v| v.camera_from_world);
         bundle::adjust(&mut views, &mut places, rounds);
-        if dbg {
-            let d = pose::difference(&before.unwrap(), &views.last().unwrap().camera_from_world);
-            let c = bundle::total_cost(&views, &places);
-            let n: usize = places.iter().map(|p| p.sights.len()).sum();
-            eprintln!(
-                "BA kf {} free {} places {} obs {} cost/obs {:.3} moved {:.4?}",
-                views.len(),
-                views.iter().filter(|v| v.free).count(),
-                places.len(),
-                n,
-                c / n as f64,
-                d.as_slice()
-            );
-        }
         for (keyframe, view) in self.keyframes.iter_mut().zip(views) {
             keyframe.camera_from_world = view.camera_from_world;
         }

@@ -164,7 +164,7 @@ impl Patch {
             if (x - start.0).abs().max((y - start.1).abs()) > largest_px {
                 return None;
             }
-            let step = dx.hypot(dy);
+            let step = (dx * dx + dy * dy).sqrt();
             if step < FOUND_PX || (step < 0.1 && step > 0.7 * last) {
                 let rest = (1.0 - like).max(0.0) * 2.0;
                 let [xx, _, yy] = self.inverse;

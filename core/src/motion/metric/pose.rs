@@ -76,7 +76,7 @@ pub(super) fn solve(start: &Isometry3<f64>, sights: &[Sight], hold: [f64; 2]) ->
         for sight in sights {
             let Some((seen, by_move, _)) = projection(&(pose * sight.world)) else { continue };
             let miss = [sight.ray[0] - seen.x, sight.ray[1] - seen.y];
-            let size = miss[0].hypot(miss[1]) / sight.sigma;
+            let size = (miss[0] * miss[0] + miss[1] * miss[1]).sqrt() / sight.sigma;
             let weight = (if size > huber { huber / size } else { 1.0 }) / (sight.sigma * sight.sigma);
             for (row, miss) in by_move.iter().zip(miss) {
                 for i in 0..6 {

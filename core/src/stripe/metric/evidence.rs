@@ -8,13 +8,15 @@ use crate::source::Yuv;
 use crate::stripe::choice::Candidate;
 
 /// Line positions per group.
-pub(super) const GROUP: usize = 4;
+pub(super) const GROUP: usize = 8;
 /// Luma pixels per cell across the line.
 const CELL_PX: usize = 2;
 /// Half widths of the ridges that are looked for, cells: a fine line, and one whose clipped core has lost its colour.
 const HALF_WIDTHS: [usize; 2] = [2, 5];
 /// Above this width, px, a line is a wide one.
 const WIDE_PX: f32 = 14.0;
+/// Cells that are looked at together.
+const SKIP: usize = 32;
 /// Peaks closer than this are one, cells.
 const PEAK_DISTANCE: usize = 6;
 /// Candidates of one group, at most: the strongest.
@@ -28,15 +30,18 @@ pub(super) fn ridges(
     line: LineDirection,
     width_px: Option<f32>,
     least: f32,
+    scratch: &mut Scratch,
 ) -> Vec<Vec<Candidate>> {
     let half_widths = match width_px {
         None => &HALF_WIDTHS[..],
         Some(width) if width < WIDE_PX => &HALF_WIDTHS[..1],
         Some(_) => &HALF_WIDTHS[1..],
     };
-    let field = Field::of(image, colour, line);
-    let mut prefix = vec![0i32; field.cells + 1];
-    let mut response = vec![0.0f32; field.cells];
+    scratch.field.fill(image, colour, line);
+    let Scratch { field, prefix, response } = scratch;
+    prefix.clear();
+    prefix.resize(field.cells + 1, 0);
+    response.resize(field.cells, 0.0);
     let scale = 1.0 / field.samples as f32;
     (0..field.groups)
         .map(|group| {
@@ -47,10 +52,18 @@ pub(super) fn ridges(
                 *to = sum;
             }
             response.fill(0.0);
-            half_widths.iter().for_each(|half| ridge_response(&prefix, *half, scale, &mut response));
-            peaks(&response, least, row, &prefix)
+            half_widths.iter().for_each(|half| ridge_response(prefix, *half, scale, response));
+            peaks(response, least, row, prefix)
         })
         .collect()
+}
+
+/// What is filled anew for each frame, in memory that is kept.
+#[derive(Default)]
+pub(super) struct Scratch {
+    field: Field,
+    prefix: Vec<i32>,
+    response: Vec<f32>,
 }
 
 /// The difference between a box and the greater of its two neighbours; keeps the larger of what is there and this.
@@ -75,7 +88,12 @@ fn peaks(response: &[f32], least: f32, row: &[i16], prefix: &[i32]) -> Vec<Candi
     let mut at = 0;
     while at < response.len() {
         if response[at] < least {
-            at += 1;
+            // Mostly there is nothing: skip what is below the least at once.
+            let none = |part: &[f32]| part.iter().map(|r| u32::from(*r >= least)).sum::<u32>() == 0;
+            at += match response.get(at..at + SKIP) {
+                Some(part) if none(part) => SKIP,
+                _ => 1,
+            };
             continue;
         }
         // The highest of this stretch, as long as it keeps rising within the distance.
@@ -118,6 +136,7 @@ fn centroid(row: &[i16], prefix: &[i32], cell: usize) -> f32 {
 }
 
 /// The laser's colour in cells of [`CELL_PX`] px across and [`GROUP`] px along the line.
+#[derive(Default)]
 struct Field {
     values: Vec<i16>,
     groups: usize,
@@ -127,15 +146,15 @@ struct Field {
 }
 
 impl Field {
-    fn of(image: Yuv<'_>, colour: LaserColour, line: LineDirection) -> Field {
+    fn fill(&mut self, image: Yuv<'_>, colour: LaserColour, line: LineDirection) {
         let (u, v) = image.chroma();
         let (shift_x, shift_y) = image.chroma_shifts();
         let (width, height) = (image.width_px(), image.height_px());
         let (chroma_width, chroma_height) = (width >> shift_x, height >> shift_y);
         // Samples per cell along the columns and the rows of the image.
         let (cell_x, cell_y) = match line {
-            LineDirection::Vertical => (CELL_PX >> shift_x.min(1), GROUP >> shift_y.min(2)),
-            LineDirection::Horizontal => (GROUP >> shift_x.min(2), CELL_PX >> shift_y.min(1)),
+            LineDirection::Vertical => (CELL_PX >> shift_x.min(1), GROUP >> shift_y.min(3)),
+            LineDirection::Horizontal => (GROUP >> shift_x.min(3), CELL_PX >> shift_y.min(1)),
         };
         let (columns, rows) = (chroma_width / cell_x, chroma_height / cell_y);
         let (groups, cells, group_step, cell_step) = match line {
@@ -147,7 +166,8 @@ impl Field {
             LaserColour::Red => (0, 1),
             LaserColour::Blue => (1, 0),
         };
-        let mut values = vec![0i16; groups * cells];
+        let values = &mut self.values;
+        values.resize(groups * cells, 0);
         let mut line_sum = vec![0i16; columns];
         for row in 0..rows {
             line_sum.fill(0);
@@ -174,6 +194,6 @@ impl Field {
                 line_sum.iter().enumerate().for_each(|(group, sum)| values[group * cells + cell_step * row] = *sum);
             }
         }
-        Field { values, groups, cells, samples: cell_x * cell_y }
+        (self.groups, self.cells, self.samples) = (groups, cells, cell_x * cell_y);
     }
 }

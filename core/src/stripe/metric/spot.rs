@@ -8,6 +8,8 @@ const SIDE: usize = 4;
 const ROUNDS: usize = 8;
 /// The window ends this many of its standard deviations from its middle.
 const WINDOW_REACH: f32 = 2.83;
+/// Light in the window of a line of height 1 and width 1: √(2π) times the standard deviation of both bells together.
+const LIGHT_OF_HEIGHT: f32 = 0.71;
 /// Sums are kept apart for so many samples side by side, for the processor to take them at once.
 const LANES: usize = 8;
 /// Error of a pixel's light as a share of the line's light there: the wall's pattern and speckle.
@@ -66,32 +68,43 @@ impl SpotShape {
         // The sides' middles are `SIDE` samples less apart than the profile is long.
         let slope = (right - left) / (profile.len() - SIDE) as f32;
         let level = left - slope * (SIDE as f32 - 1.0) / 2.0;
-        let mut at = start;
+        let (mut at, mut light) = (start, 0.0);
         for _ in 0..ROUNDS {
-            let sums = self.sums(profile, at, level, slope, false)?;
-            if sums.light <= 1e-5 {
+            let moment;
+            (light, moment) = self.sums(profile, at, level, slope)?;
+            if light <= 1e-5 {
                 return None;
             }
             // Under a window as wide as the line the centroid goes half the way.
-            let step = (2.0 * sums.moment / sums.light).clamp(-0.5 * self.width_px, 0.5 * self.width_px);
+            let step = (2.0 * moment / light).clamp(-0.5 * self.width_px, 0.5 * self.width_px);
             at += step;
             if step.abs() < settled_px {
                 break;
             }
         }
-        let sums = self.sums(profile, at, level, slope, true)?;
+        let height = light / (LIGHT_OF_HEIGHT * self.width_px);
         let middle = (profile.len() / 2) as f32;
-        (sums.light > 1e-5 && (at - middle).abs() < self.half as f32 - SIDE as f32).then(|| Spot {
+        ((at - middle).abs() < self.half as f32 - SIDE as f32).then(|| Spot {
             at,
-            sigma: 2.0 * sums.variance.sqrt() / sums.light + self.glare_px(left, right, sums.height),
-            height: sums.height,
+            sigma: self.sigma_px(light) + self.glare_px(left, right, height),
+            height,
             background: (left + right) / 2.0,
         })
     }
 
-    /// Sums over the window around a place: light above a slope, and what else is asked for.
+    /// Standard deviation of the centroid, px, for bell-shaped line and window: what the wall's pattern does, and what
+    /// noise does to the window's light.
+    fn sigma_px(&self, light: f32) -> f32 {
+        let window = WINDOW_SHARE * self.width_px;
+        let both = 0.283 * self.width_px;
+        let pattern = 2.0 * PATTERN_SHARE * (0.141 * both).sqrt();
+        let noise = 2.0 * NOISE_LIGHT * (0.886 * window * window * window).sqrt() / light;
+        (pattern * pattern + noise * noise).sqrt()
+    }
+
+    /// Light above a slope in the window around a place, and its moment about that place.
     #[inline]
-    fn sums(&self, profile: &[f32], at: f32, level: f32, slope: f32, all: bool) -> Option<Sums> {
+    fn sums(&self, profile: &[f32], at: f32, level: f32, slope: f32) -> Option<(f32, f32)> {
         let reach = WINDOW_REACH * WINDOW_SHARE * self.width_px;
         if !(at > -reach && at < profile.len() as f32 + reach) {
             return None;
@@ -102,39 +115,22 @@ impl SpotShape {
         let window = &profile[from..from + lanes * LANES];
         let scale = 1.0 / (reach * reach);
         let (mut light, mut moment) = ([0.0f32; LANES], [0.0f32; LANES]);
-        let (mut variance, mut height) = ([0.0f32; LANES], [0.0f32; LANES]);
-        for (k, chunk) in window.chunks_exact(LANES).enumerate() {
-            let base = (from + k * LANES) as f32;
+        // Offsets from the place, and the slope's level there: added to lane by lane.
+        let mut d: [f32; LANES] = std::array::from_fn(|lane| (from + lane) as f32 - at);
+        let level_at = level + slope * at;
+        for chunk in window.chunks_exact(LANES) {
             for lane in 0..LANES {
-                let x = base + lane as f32;
-                let d = x - at;
                 // (1 − (d/reach)²)⁴ is nearly the bell exp(−4·(d/reach)²), and needs no exponential.
-                let u = (1.0 - d * d * scale).max(0.0);
+                let u = 1.0 - d[lane] * d[lane] * scale;
+                let u = if u > 0.0 { u } else { 0.0 };
                 let weight = u * u * (u * u);
-                let weighted = weight * (chunk[lane] - level - slope * x);
+                let weighted = weight * (chunk[lane] - level_at - slope * d[lane]);
                 light[lane] += weighted;
-                moment[lane] += weighted * d;
-            }
-            if all {
-                for lane in 0..LANES {
-                    let x = base + lane as f32;
-                    let d = x - at;
-                    let u = (1.0 - d * d * scale).max(0.0);
-                    let weight = u * u * (u * u);
-                    let q = chunk[lane] - level - slope * x;
-                    let error = NOISE_LIGHT * NOISE_LIGHT + PATTERN_SHARE * PATTERN_SHARE * q * q;
-                    variance[lane] += weight * weight * d * d * error;
-                    height[lane] = height[lane].max(if u > 0.0 { q } else { 0.0 });
-                }
+                moment[lane] += weighted * d[lane];
+                d[lane] += LANES as f32;
             }
         }
-        let total = |part: &[f32; LANES]| part.iter().sum::<f32>();
-        Some(Sums {
-            light: total(&light),
-            moment: total(&moment),
-            variance: total(&variance),
-            height: height.iter().copied().fold(0.0, f32::max),
-        })
+        Some((light.iter().sum(), moment.iter().sum()))
     }
 
     /// What a glint on one side does to the centre, px: the background is not the straight slope that it is taken for.
@@ -186,18 +182,10 @@ fn side(samples: &[f32]) -> f32 {
     (samples.iter().sum::<f32>() - low - high) / (samples.len() - 2) as f32
 }
 
-/// Sums over a window.
-struct Sums {
-    light: f32,
-    moment: f32,
-    variance: f32,
-    height: f32,
-}
-
 /// Softens the wall's pattern, `samples` a line position, over its neighbours in both directions ([1 2 1] twice): what
 /// an encoder leaves of the finest pattern is noise. Rows of NaN stay so and count for nothing.
 pub(super) fn soften(pattern: &mut [f32], samples: usize) {
-    for row in pattern.chunks_exact_mut(samples) {
+    for row in pattern.chunks_exact_mut(samples).filter(|row| row[0].is_finite()) {
         for _ in 0..2 {
             let mut before = row[0];
             for i in 1..samples - 1 {
@@ -208,20 +196,20 @@ pub(super) fn soften(pattern: &mut [f32], samples: usize) {
         }
     }
     let rows = pattern.len() / samples;
-    let mut before = vec![f32::NAN; samples];
+    let (mut before, mut kept) = (vec![f32::NAN; samples], vec![f32::NAN; samples]);
     for row in 0..rows {
         let (done, rest) = pattern.split_at_mut(row * samples + samples);
         let here = &mut done[row * samples..];
-        let kept: Vec<f32> = here.to_vec();
+        kept.copy_from_slice(here);
         let after = rest.get(..samples);
         if here[0].is_finite()
             && before[0].is_finite()
             && let Some(after) = after.filter(|a| a[0].is_finite())
         {
-            for i in 0..samples {
-                here[i] = 0.25 * before[i] + 0.5 * here[i] + 0.25 * after[i];
+            for ((here, before), after) in here.iter_mut().zip(&before).zip(after) {
+                *here = 0.25 * before + 0.5 * *here + 0.25 * after;
             }
         }
-        before = kept;
+        std::mem::swap(&mut before, &mut kept);
     }
 }
