@@ -26,6 +26,8 @@ use crate::rig::LineDirection;
 
 /// Largest file that is read, bytes.
 pub const MAX_FILE_BYTES: u64 = 256 << 20;
+/// Longest line, bytes.
+pub const MAX_LINE_BYTES: u64 = 64 << 10;
 /// Neighbouring rows further apart in time than this say nothing about what lies between them, s.
 pub const MAX_STEP_S: f64 = 1.0;
 /// How far from the first position another one may be, mm: further away the unit is wrong, and the map has no room.
@@ -91,11 +93,18 @@ impl PoseTrack {
     /// without any pose. The message names line, column, value and what was expected.
     pub fn read(path: &Path, line: LineDirection, max_rows: u32) -> Result<PoseTrack> {
         let name = path.display().to_string();
-        let file = File::open(path).map_err(|e| Error::io(path, e))?;
-        let bytes = file.metadata().map_err(|e| Error::io(path, e))?.len();
-        if bytes > MAX_FILE_BYTES {
-            return Err(Error::input(name, format!("{bytes} bytes"), format!("at most {MAX_FILE_BYTES} bytes")));
+        let facts = std::fs::metadata(path).map_err(|e| Error::io(path, e))?;
+        if !facts.is_file() {
+            return Err(Error::input(name, "no file", "a CSV file of poses"));
         }
+        if facts.len() > MAX_FILE_BYTES {
+            return Err(Error::input(
+                name,
+                format!("{} bytes", facts.len()),
+                format!("at most {MAX_FILE_BYTES} bytes"),
+            ));
+        }
+        let file = File::open(path).map_err(|e| Error::io(path, e))?;
         PoseTrack::parse(BufReader::new(file.take(MAX_FILE_BYTES)), &name, line, max_rows)
     }
 
@@ -163,13 +172,12 @@ impl Lines<'_> {
     fn next(&mut self, from: &mut impl BufRead) -> Result<bool> {
         self.number += 1;
         self.text.clear();
-        match from.read_line(&mut self.text) {
+        let (name, number) = (self.name, self.number);
+        let bad = |found: String| Err(Error::input(format!("{name}, line {number}"), found, "lines of a CSV file"));
+        match from.take(MAX_LINE_BYTES).read_line(&mut self.text) {
+            Ok(bytes) if bytes as u64 == MAX_LINE_BYTES => bad(format!("{bytes} bytes or more in one line")),
             Ok(bytes) => Ok(bytes > 0),
-            Err(e) if e.kind() == std::io::ErrorKind::InvalidData => Err(Error::input(
-                format!("{}, line {}", self.name, self.number),
-                "no UTF-8 text",
-                "lines of a CSV file",
-            )),
+            Err(e) if e.kind() == std::io::ErrorKind::InvalidData => bad("no UTF-8 text".into()),
             Err(e) => Err(Error::io(self.name, e)),
         }
     }
@@ -492,5 +500,10 @@ mod tests {
     fn what_is_no_text_is_refused() {
         let refused = PoseTrack::parse(&b"frame,x_mm\xff\n"[..], "video.mp4", LineDirection::Vertical, 10);
         assert!(refused.expect_err("no text").to_string().contains("no UTF-8 text"));
+        let long = message(&",".repeat(1 << 20));
+        assert!(long.contains("line 1: 65536 bytes or more in one line"), "{long}");
+        let folder = tempfile::tempdir().expect("temporary folder");
+        let refused = PoseTrack::read(folder.path(), LineDirection::Vertical, 10).expect_err("a folder");
+        assert_eq!(refused.kind(), "bad_input", "{refused}");
     }
 }
