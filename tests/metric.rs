@@ -47,6 +47,7 @@ fn measure(scene: Scene, seconds: f64, fps: f64, seed: u64, laser_on: impl Fn(u3
         source: video,
         source_name: "video.mp4".into(),
         fps: None,
+        poses: None,
         recorded_at: jiff::Timestamp::UNIX_EPOCH,
         rig: simulation.rig().clone(),
         recipe,

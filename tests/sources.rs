@@ -35,6 +35,7 @@ fn process_source(source: &Path, rig: &Rig) -> Result<Manifest> {
         recorded_at: jiff::Timestamp::UNIX_EPOCH,
         rig: rig.clone(),
         recipe: Recipe::load("paper").expect("built in"),
+        poses: None,
         out_dir: out_dir.clone(),
         products: vec![ProductGroup::Depth, ProductGroup::Cloud],
         live_segments: false,

@@ -1,13 +1,28 @@
 //! Frames → motion: how the camera moved.
 //!
 //! Two ways: [`paper`] follows the image from frame to frame, in pixels; [`metric`] finds the camera's pose in
-//! millimetres against the surface that the laser has measured.
+//! millimetres against the surface that the laser has measured. Poses may also be given with the source: [`track`].
 
 pub mod metric;
 pub mod paper;
 mod similarity;
+pub mod track;
+
+use nalgebra::{Isometry3, UnitQuaternion, Vector3};
 
 use crate::rig::LineDirection;
+
+/// `camera_from_world` at the run's start (lib.rs): the world is the camera's frame, turned so that x lies along the
+/// travel.
+pub fn start_pose(line: LineDirection) -> Isometry3<f64> {
+    match line {
+        LineDirection::Vertical => Isometry3::identity(),
+        LineDirection::Horizontal => Isometry3::from_parts(
+            Vector3::zeros().into(),
+            UnitQuaternion::from_axis_angle(&Vector3::z_axis(), std::f64::consts::FRAC_PI_2),
+        ),
+    }
+}
 
 /// A corner followed from the previous frame to this one.
 #[derive(Clone, Copy, Debug, PartialEq)]

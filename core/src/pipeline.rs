@@ -4,6 +4,7 @@ mod colours;
 mod folder;
 mod metric;
 mod paper;
+mod poses;
 mod products;
 mod progress;
 mod quality;
@@ -19,8 +20,9 @@ use serde::{Deserialize, Serialize};
 
 use crate::depth_map::sheet::WallColours;
 use crate::depth_map::strips::TextureStrip;
-use crate::error::Result;
+use crate::error::{Error, Result};
 use crate::export::manifest::Manifest;
+use crate::motion::track::TrackUse;
 use crate::recipe::{Method, Recipe};
 use crate::rig::Rig;
 use crate::source::{self, Image, Source, SourceInfo};
@@ -81,12 +83,34 @@ pub struct Request {
     pub rig: Rig,
     /// How to process it.
     pub recipe: Recipe,
+    /// A CSV of the camera's poses, such as a robot's odometry ([`track`](crate::motion::track) says its form); only
+    /// with method `metric`. `pose.track` in the recipe says what they are for.
+    pub poses: Option<PathBuf>,
     /// The folder for the products; made where it is missing, refused where it is not empty.
     pub out_dir: PathBuf,
     /// The products to make.
     pub products: Vec<ProductGroup>,
     /// Also write numbered recording segments to `recording/` inside `out_dir` while the work goes on.
     pub live_segments: bool,
+}
+
+impl Request {
+    /// What the given poses are for; `None` where there are none.
+    fn track_use(&self) -> Option<TrackUse> {
+        self.poses.as_ref().map(|_| self.recipe.pose.track)
+    }
+
+    /// The publication's way measures in pixels: it has no place for a pose.
+    fn check_poses(&self) -> Result<()> {
+        match &self.poses {
+            Some(path) if self.recipe.method == Method::Paper => Err(Error::input(
+                path.display().to_string(),
+                "poses for method `paper`, which places profiles by the image's motion alone",
+                "a recipe with method `metric`, or no poses",
+            )),
+            _ => Ok(()),
+        }
+    }
 }
 
 /// What the pipeline says while it works. The server reads these as JSON lines from its child.
@@ -133,6 +157,7 @@ pub type Observer<'a> = dyn FnMut(Event) -> std::ops::ControlFlow<()> + 'a;
 /// [`Error::Input`] for a source, rig or folder that cannot be used, [`Error::Cancelled`] when the observer
 /// says stop. Whatever was written is then removed again.
 pub fn process(request: &Request, observer: &mut Observer<'_>) -> Result<Manifest> {
+    request.check_poses()?;
     let source = source::open(&request.source, &request.source_name, request.fps)?;
     let info = source.info().clone();
     request.rig.check_image_size(&request.source_name, info.width_px, info.height_px)?;
@@ -149,7 +174,7 @@ fn measure_and_write(
     progress: &mut Progress<'_, '_>,
 ) -> Result<Manifest> {
     let mut products = Products::create(request, info)?;
-    let mut quality = QualityCounter::new();
+    let mut quality = QualityCounter::new(request.track_use());
     let mut run =
         Run { request, products: &mut products, quality: &mut quality, progress, timings: Timings::default() };
     match request.recipe.method {

@@ -7,6 +7,7 @@ use serde::{Deserialize, Serialize};
 use serde_json::Value;
 
 use crate::error::{Error, Result};
+use crate::motion::track::TrackUse;
 use crate::stripe::SpotChoice;
 
 /// The built-in recipes, the default first.
@@ -171,6 +172,9 @@ recipe! {
         waiting_max: u32 = 600, "frames", whole(2, 10000);
         /// Frames without motion found, one after the other, after which the way is taken to be broken.
         lost_max: u32 = 15, "frames", whole(1, 1000);
+        /// What poses given with the source (`--poses`) are for: they are the camera's poses instead of the image's
+        /// motion, or only the prior that says where to look for it and carries the pose on where it is lost.
+        track: TrackUse = TrackUse::Instead, "", choice(&["instead", "prior"]);
     }
     /// How the laser line is found in a frame (method `paper`; METHOD.md, "Spot centroid").
     stripe: StripeOptions {

@@ -43,8 +43,8 @@ pub struct Placed<T> {
     pub measured: Measured<T>,
     /// The camera's place; `None` where the motion was lost: such a frame gives nothing to the surface.
     pub world_from_camera: Option<WorldFromCamera>,
-    /// How many of the pose's degrees of freedom were measured; the others are the starting ones. 0 where the motion
-    /// was lost.
+    /// How many of the pose's degrees of freedom were measured, or given with the source; the others are the starting
+    /// ones. 0 where the image's motion was lost, even if a given motion carried the pose on.
     pub degrees_of_freedom: u8,
     /// The part of the way without a break that the frame belongs to, from 0.
     pub part: u32,

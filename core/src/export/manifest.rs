@@ -118,7 +118,7 @@ pub struct Manifest {
     pub schema_version: u32,
     /// `stria` and its version.
     pub software: String,
-    /// The source's files as read.
+    /// The source's files as read, and the poses given with it.
     pub source: Vec<FileEntry>,
     /// The rig as used.
     pub rig: serde_json::Value,

@@ -4,12 +4,13 @@ use std::collections::VecDeque;
 use std::sync::Arc;
 
 use super::colours::ColourFinder;
+use super::poses::Poses;
 use super::reading::{self, Seen};
 use super::recent::{Recent, RecentFrames};
 use super::{Cargo, Colours, Picture, Run};
 use crate::depth_map::sheet::WallColours;
 use crate::error::Result;
-use crate::motion::metric::{Odometry, SettledPose};
+use crate::motion::metric::SettledPose;
 use crate::source::Source;
 use crate::stripe::metric::stripe_stages;
 use crate::surface::{Measured, Placed};
@@ -22,7 +23,7 @@ const MAX_PICTURES: usize = 12;
 pub(super) fn measure(run: &mut Run<'_, '_, '_, '_>, source: Box<dyn Source>) -> Result<()> {
     let (rig, recipe) = (&run.request.rig, &run.request.recipe);
     let (colours_wanted, between) = (run.products.wants_colours(), run.products.wants_wall_colours());
-    let mut odometry = Odometry::new(rig, &recipe.pose);
+    let mut poses = Poses::new(run.request)?;
     let mut recent = RecentFrames::default();
     let mut waiting = WaitingFrames::default();
     let mut colours = ColourFinder::new(!between);
@@ -35,9 +36,8 @@ pub(super) fn measure(run: &mut Run<'_, '_, '_, '_>, source: Box<dyn Source>) ->
             let Seen { frame, found } = seen?;
             // Frame + line ▶ motion, against the surface measured so far.
             let plain = run.timings.time("triangulation", || triangulate(&found.stripe, rig));
-            let motion = run.timings.time("motion", || {
-                odometry.track(frame.index, frame.image.yuv(), &found.stripe, &plain, found.width_px())
-            });
+            let (motion, moved_px) =
+                run.timings.time("motion", || poses.track(&frame, &found.stripe, &plain, found.width_px()));
             // Line + the wall without it ▶ Stripe ▶ Profile.
             let positions = found.stripe.across_px.len();
             let pose = motion.camera_from_world;
@@ -45,7 +45,6 @@ pub(super) fn measure(run: &mut Run<'_, '_, '_, '_>, source: Box<dyn Source>) ->
             let stripe = run.timings.time("stripe", || measurer.measure(found, wall.as_ref().map(|(_, wall)| wall)));
             let profile = run.timings.time("triangulation", || triangulate(&stripe, rig));
             run.products.stripe(&stripe)?;
-            let moved_px = motion.shift.dx_px.unwrap_or(0.0).hypot(motion.shift.dy_px.unwrap_or(0.0));
             let image = Arc::new(frame.image);
             let picture = run.products.wants_picture(frame.time_s) && waiting.pictures() < MAX_PICTURES;
             let picture = picture.then(|| Picture { image: image.clone(), effective_area: None, row_threshold: None });
@@ -68,17 +67,17 @@ pub(super) fn measure(run: &mut Run<'_, '_, '_, '_>, source: Box<dyn Source>) ->
                 waiting.colour(frame, wall);
             }
             // Poses that are final ▶ surface.
-            let settled = odometry.take_settled();
+            let settled = poses.take_settled();
             run.add(waiting.place(settled))?;
             run.progress.frame()?;
         }
-        run.timings.time("motion", || odometry.finish());
-        let settled = odometry.take_settled();
+        run.timings.time("motion", || poses.finish());
+        let settled = poses.take_settled();
         run.add(waiting.place(settled))?;
         let report = reading.join()?;
         run.timings.add("decoding", report.decoding);
         run.timings.add("stripe", report.stripes);
-        report.warnings.into_iter().try_for_each(|warning| run.progress.warn(warning))
+        report.warnings.into_iter().chain(poses.warnings()).try_for_each(|warning| run.progress.warn(warning))
     })
 }
 

@@ -19,6 +19,7 @@ use crate::export::preview::{self, PreviewText};
 use crate::export::tiles::{TileGrid, TileWriter};
 use crate::export::trajectory_csv::{TrajectoryRow, TrajectoryWriter};
 use crate::export::{depth_png, depth_tif, texture};
+use crate::motion::track::TrackUse;
 use crate::recording::{FrameSteps, RecordedRun, Recorder, Segment};
 use crate::rig::{LineDirection, Rig};
 use crate::source::{SourceInfo, encoded_frames};
@@ -255,7 +256,7 @@ impl<'a> Products<'a> {
         let mut manifest = Manifest {
             schema_version: SCHEMA_VERSION,
             software: format!("stria {}", env!("CARGO_PKG_VERSION")),
-            source: hash_source(info, &request.source_name)?,
+            source: hash_source(info, request)?,
             rig: request.rig.to_json(),
             rig_sha256: sha256_of_bytes(rig_toml.as_bytes()),
             recipe: serde_json::to_value(&request.recipe).map_err(|e| Error::internal("manifest", e))?,
@@ -422,13 +423,17 @@ fn trajectory_row(placed: &Placed<Cargo>) -> TrajectoryRow {
     }
 }
 
-fn hash_source(info: &SourceInfo, source_name: &str) -> Result<Vec<FileEntry>> {
+fn hash_source(info: &SourceInfo, request: &Request) -> Result<Vec<FileEntry>> {
     let single = info.files.len() == 1;
     let name = |path: &Path| match path.file_name() {
         Some(file) if !single => file.to_string_lossy().into_owned(),
-        _ => source_name.to_string(),
+        _ => request.source_name.clone(),
     };
-    info.files.iter().map(|file| FileEntry::of(file, name(file))).collect()
+    let poses = request.poses.iter().map(|file| {
+        let name = file.file_name().map_or_else(|| "poses".into(), |name| name.to_string_lossy().into_owned());
+        FileEntry::of(file, name)
+    });
+    info.files.iter().map(|file| FileEntry::of(file, name(file))).chain(poses).collect()
 }
 
 /// Says in words what the figures mean for a person.
@@ -456,7 +461,8 @@ fn warn_of_quality(quality: &Quality, gaps: &[Gap], request: &Request, progress:
         return progress.warn("the run has a single frame: there is no motion, and the map is one column wide".into());
     }
     let lost = quality.frames - 1 - quality.frames_tracked;
-    if lost > 0 {
+    // Of given poses that leave frames out, their reader has said so.
+    if lost > 0 && request.track_use() != Some(TrackUse::Instead) {
         let places = gaps.iter().filter(|g| g.reason == "not_tracked").count();
         progress.warn(format!(
             "the motion was lost in {lost} of {} frames, in {places} places: lengths along the travel are too short there",

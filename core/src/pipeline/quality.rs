@@ -1,6 +1,7 @@
 //! How well the run was measured: figures, gaps, and the paper's resolution for the run's own geometry.
 
 use crate::export::manifest::{Gap, Quality, Resolution};
+use crate::motion::track::TrackUse;
 use crate::rig::Rig;
 use crate::stripe::Stripe;
 use crate::surface::Placed;
@@ -13,6 +14,7 @@ const MEDIAN_SAMPLES: usize = 8192;
 
 /// Counts while the frames go by.
 pub(super) struct QualityCounter {
+    given: Option<TrackUse>,
     quality: Quality,
     line_positions: u64,
     gaps: Vec<Gap>,
@@ -22,8 +24,10 @@ pub(super) struct QualityCounter {
 }
 
 impl QualityCounter {
-    pub(super) fn new() -> QualityCounter {
+    /// `given` says what poses given with the source are for.
+    pub(super) fn new(given: Option<TrackUse>) -> QualityCounter {
         QualityCounter {
+            given,
             quality: Quality::default(),
             line_positions: 0,
             gaps: Vec::new(),
@@ -61,10 +65,12 @@ impl QualityCounter {
         if let Some(z_mm) = measured.profile.median_z_mm() {
             self.distance_mm.add(z_mm);
         }
-        let tracked = measured.shift.dx_px.is_some() && placed.world_from_camera.is_some();
-        if tracked {
-            quality.frames_tracked += 1;
-        } else if measured.frame > 0 {
+        // A pose that is given needs no motion of the image; then the first frame may lack one, too.
+        let has_pose = placed.world_from_camera.is_some();
+        let tracked = has_pose && (measured.shift.dx_px.is_some() || self.given.is_some());
+        let first = measured.frame == 0;
+        quality.frames_tracked += u64::from(tracked && !first);
+        if if first { !has_pose && self.given == Some(TrackUse::Instead) } else { !tracked } {
             add_gap(&mut self.gaps, measured.frame, "not_tracked");
         }
         if let Some(residual_px) = measured.shift.residual_px {

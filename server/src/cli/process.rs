@@ -41,6 +41,14 @@ pub(super) struct Process {
     /// The folder for the products; it is made, or must be empty
     #[arg(long, value_name = "DIR")]
     out: PathBuf,
+    /// A CSV of the camera's poses, e.g. from the robot's odometry; used instead of the image's motion
+    ///
+    /// Its first line names the columns, in any order: `frame` (from 0) or `time_s` (since the first frame), and `x_mm`,
+    /// `y_mm`, `z_mm` (or `x_m` …); `roll_deg`, `pitch_deg`, `yaw_deg` if known. Other columns are ignored, empty fields are
+    /// not known, times between two rows are interpolated. A trajectory.csv of stria is such a file. With --set
+    /// pose.track=prior the poses only say where to look for the image's motion, and carry the pose on where it is lost.
+    #[arg(long, value_name = "FILE")]
+    poses: Option<PathBuf>,
     /// Make only these product groups, separated by commas
     #[arg(long, value_name = "A,B", value_delimiter = ',', value_parser = product_group)]
     only: Vec<ProductGroup>,
@@ -132,6 +140,7 @@ impl Process {
             recorded_at: self.recorded_at.unwrap_or_else(|| time_of(&self.source)),
             rig,
             recipe,
+            poses: self.poses.clone(),
             out_dir: self.out.clone(),
             products: only,
             live_segments: self.live_segments,

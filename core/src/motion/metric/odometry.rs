@@ -2,7 +2,7 @@
 
 use std::collections::{BTreeMap, HashMap, VecDeque};
 
-use nalgebra::{Isometry3, Matrix3, Point3, UnitQuaternion, Vector3};
+use nalgebra::{Isometry3, Matrix3, Point3, Vector3};
 
 use super::bundle::{self, Place, PlaceDepth, PlaceSight, View};
 use super::depth::{self, Known};
@@ -12,7 +12,7 @@ use super::patch::Found;
 use super::pose::{self, Sight};
 use crate::geometry::{RawPixel, WorldFromCamera};
 use crate::motion::similarity::{FEWEST_CORNERS, median, scale_and_residual};
-use crate::motion::{Shift, TrackedCorner};
+use crate::motion::{Shift, TrackedCorner, start_pose};
 use crate::recipe::PoseOptions;
 use crate::rig::{LineDirection, Rig};
 use crate::source::Yuv;
@@ -83,7 +83,7 @@ pub struct SettledPose {
     pub world_from_camera: Option<WorldFromCamera>,
     /// Part of the way without a break that the frame belongs to, from 0; a surface is not joined across parts.
     pub part: u32,
-    /// 6, or 3 where the scene did not tell the rotation.
+    /// 6, or 3 where the scene did not tell the rotation, or 0 where a given motion carried the pose on.
     pub degrees_of_freedom: u8,
 }
 
@@ -99,6 +99,9 @@ pub struct Odometry {
     settled: Vec<SettledPose>,
     last: Option<Last>,
     lost: u32,
+    /// Whether the given motion has carried the pose on in every frame since the image's was lost.
+    carried: bool,
+    carried_frames: u32,
     part: u32,
 }
 
@@ -212,11 +215,16 @@ impl Odometry {
             settled: Vec::new(),
             last: None,
             lost: 0,
+            carried: false,
+            carried_frames: 0,
             part: 0,
         }
     }
 
     /// Takes the next frame with its stripe (`line_width_px` wide at half its height) and profile.
+    ///
+    /// `given` is the motion since the frame before as something else knows it, `camera_now_from_camera_before`: the
+    /// landmarks are looked for where it puts them, and it carries the pose on while they are lost.
     pub fn track(
         &mut self,
         frame: u32,
@@ -224,6 +232,7 @@ impl Odometry {
         stripe: &Stripe,
         profile: &Profile,
         line_width_px: f32,
+        given: Option<Isometry3<f64>>,
     ) -> Motion {
         let view = View3 {
             gray: Gray::of(image),
@@ -233,14 +242,14 @@ impl Odometry {
         };
         let rows = dense(profile, stripe.across_px.len());
         let Some(last) = self.last.take() else {
-            return self.begin(&view, profile, rows, self.start_pose());
+            return self.begin(&view, profile, rows, start_pose(self.rig.laser.line));
         };
-        match self.follow(&view, &last) {
+        match self.follow(&view, &last, given) {
             Some(followed) => {
                 self.lost = 0;
                 self.advance(&view, profile, rows, last, followed)
             }
-            None => self.miss(&view, profile, rows, last),
+            None => self.miss(&view, profile, rows, last, given),
         }
     }
 
@@ -257,15 +266,9 @@ impl Odometry {
         }
     }
 
-    /// The world's start (lib.rs): the camera's frame, turned so that x lies along the travel.
-    fn start_pose(&self) -> Isometry3<f64> {
-        match self.rig.laser.line {
-            LineDirection::Vertical => Isometry3::identity(),
-            LineDirection::Horizontal => Isometry3::from_parts(
-                Vector3::zeros().into(),
-                UnitQuaternion::from_axis_angle(&Vector3::z_axis(), std::f64::consts::FRAC_PI_2),
-            ),
-        }
+    /// Frames, so far, whose image's motion was lost and whose pose the given motion carried on.
+    pub fn carried_frames(&self) -> u32 {
+        self.carried_frames
     }
 
     /// The first frame of a part: nothing to follow yet.
@@ -298,13 +301,24 @@ impl Odometry {
     }
 
     /// Lost: wait for the wall to come back; after a while take the way to be broken and begin anew where it was lost.
-    fn miss(&mut self, view: &View3<'_>, profile: &Profile, rows: Vec<Option<Point3<f64>>>, mut last: Last) -> Motion {
+    /// Where the given motion carries the pose on, the way is not broken.
+    fn miss(
+        &mut self,
+        view: &View3<'_>,
+        profile: &Profile,
+        rows: Vec<Option<Point3<f64>>>,
+        mut last: Last,
+        given: Option<Isometry3<f64>>,
+    ) -> Motion {
         self.lost += 1;
+        self.carried = given.is_some() && (self.carried || self.lost == 1);
+        self.carried_frames += u32::from(self.carried);
+        last.pose = given.map_or(last.pose, |moved| moved * last.pose);
         // At the very start of a part nothing is lost with it.
         let lost_max = if self.keyframes.len() < 2 { 0 } else { self.options.lost_max };
         if self.lost > lost_max && profile.points.len() >= FEWEST_POINTS {
             self.lost = 0;
-            self.part += 1;
+            self.part += u32::from(!self.carried);
             let pose = last.pose;
             self.adjust(ROUNDS);
             self.settle_all();
@@ -312,13 +326,14 @@ impl Odometry {
             self.keyframes.clear();
             return self.begin(view, profile, rows, pose);
         }
-        self.wait(view.frame, None, Vec::new(), 6);
-        last.velocity = Isometry3::identity();
+        let pose = self.carried.then_some(last.pose);
+        self.wait(view.frame, pose, Vec::new(), 0);
+        last.velocity = given.unwrap_or_default();
         last.places.clear();
         last.profile.clear();
         self.landmarks.values_mut().for_each(|landmark| landmark.from_line_px = None);
         self.last = Some(last);
-        Motion { camera_from_world: None, shift: Shift::default() }
+        Motion { camera_from_world: pose, shift: Shift::default() }
     }
 
     fn advance(
@@ -380,14 +395,15 @@ struct Followed {
 
 impl Odometry {
     /// Finds the landmarks near where the last motion puts them; where that fails, in the shrunk image first.
-    fn follow(&mut self, view: &View3<'_>, last: &Last) -> Option<Followed> {
-        let predicted = last.velocity * last.pose;
+    fn follow(&mut self, view: &View3<'_>, last: &Last, given: Option<Isometry3<f64>>) -> Option<Followed> {
+        let steady = last.velocity * last.pose;
+        let predicted = given.map_or(steady, |moved| moved * last.pose);
         if self.probe(view, &predicted)
             && let Some(followed) = self.solve_frame(view, &predicted, &HashMap::new())
         {
             return Some(followed);
         }
-        [predicted, last.pose].iter().find_map(|start| {
+        [Some(predicted), given.map(|_| steady), Some(last.pose)].iter().flatten().find_map(|start| {
             let (coarse, places) = self.coarse_pose(view, start)?;
             self.solve_frame(view, &coarse, &places)
         })
