@@ -157,7 +157,11 @@ pub struct Cell {
 /// The depth map and the texture map of a run, on one grid.
 pub struct SurfaceMap {
     grid: Grid,
-    tiles: HashMap<TileIndex, Tile>,
+    /// Tiles in memory, in no order, and where each is.
+    tiles: Vec<Tile>,
+    places: HashMap<TileIndex, usize>,
+    /// The tile that was asked for last: mostly it is the next one too.
+    last: Option<(TileIndex, usize)>,
     capacity: usize,
     clock: u64,
     scratch: File,
@@ -173,6 +177,9 @@ pub struct SurfaceMap {
 pub type TileIndex = (i64, i64);
 
 struct Tile {
+    index: TileIndex,
+    /// Changed since the changes were last asked for.
+    changed: bool,
     depth_mm: Vec<f32>,
     /// What the depths weigh so far: 0 where nothing was measured.
     weight: Vec<f32>,
@@ -190,7 +197,9 @@ impl SurfaceMap {
         let scratch = tempfile::tempfile_in(scratch_dir).map_err(|e| Error::io(scratch_dir, e))?;
         Ok(SurfaceMap {
             grid,
-            tiles: HashMap::new(),
+            tiles: Vec::new(),
+            places: HashMap::new(),
+            last: None,
             capacity: tiles_in_memory.max(4),
             clock: 0,
             scratch,
@@ -208,8 +217,7 @@ impl SurfaceMap {
         let tile = self.tile(index)?;
         let was_empty = tile.depth_mm[at].is_nan();
         (tile.depth_mm[at], tile.weight[at]) = (depth_mm, 1.0);
-        tile.dirty = true;
-        self.changed.insert(index);
+        (tile.dirty, tile.changed) = (true, true);
         self.measured += u64::from(was_empty);
         self.reach([column, column], row);
         Ok(())
@@ -238,8 +246,7 @@ impl SurfaceMap {
                     tile.texture[at] = [red, green, blue, 1];
                 }
             }
-            tile.dirty = true;
-            self.changed.insert(index);
+            (tile.dirty, tile.changed) = (true, true);
             self.measured += new;
             done += part.len();
         }
@@ -262,8 +269,7 @@ impl SurfaceMap {
         let tile = self.tile(index)?;
         if replace || tile.texture[at][3] == 0 {
             tile.texture[at] = [rgb[0], rgb[1], rgb[2], 1];
-            tile.dirty = true;
-            self.changed.insert(index);
+            (tile.dirty, tile.changed) = (true, true);
         }
         Ok(())
     }
@@ -276,6 +282,8 @@ impl SurfaceMap {
 
     /// The tiles that changed since this was last asked.
     pub fn take_changed(&mut self) -> Vec<TileIndex> {
+        let in_memory = self.tiles.iter_mut().filter_map(|tile| std::mem::take(&mut tile.changed).then_some(tile.index));
+        self.changed.extend(in_memory);
         self.changed.drain().collect()
     }
 
@@ -316,38 +324,49 @@ impl SurfaceMap {
     }
 
     fn exists(&self, index: TileIndex) -> bool {
-        self.tiles.contains_key(&index) || self.slots.contains_key(&index)
+        self.places.contains_key(&index) || self.slots.contains_key(&index)
     }
 
     /// The tile, from memory, from the scratch file, or new.
     fn tile(&mut self, index: TileIndex) -> Result<&mut Tile> {
         self.clock += 1;
-        if !self.tiles.contains_key(&index) {
-            if self.tiles.len() >= self.capacity {
-                self.put_oldest_aside()?;
-            }
-            let tile = match self.slots.get(&index) {
-                Some(slot) => self.read_tile(*slot)?,
-                None => Tile::empty(),
-            };
-            self.tiles.insert(index, tile);
-        }
-        let clock = self.clock;
-        match self.tiles.get_mut(&index) {
-            Some(tile) => {
-                tile.used = clock;
-                Ok(tile)
-            }
-            None => unreachable!("inserted above"),
-        }
+        let at = match self.last {
+            Some((last, at)) if last == index => at,
+            _ => self.find_tile(index)?,
+        };
+        self.last = Some((index, at));
+        let tile = &mut self.tiles[at];
+        tile.used = self.clock;
+        Ok(tile)
     }
 
-    fn put_oldest_aside(&mut self) -> Result<()> {
-        let Some((&index, _)) = self.tiles.iter().min_by_key(|(_, tile)| tile.used) else { return Ok(()) };
-        let Some(tile) = self.tiles.remove(&index) else { return Ok(()) };
+    fn find_tile(&mut self, index: TileIndex) -> Result<usize> {
+        if let Some(at) = self.places.get(&index) {
+            return Ok(*at);
+        }
+        let tile = match self.slots.get(&index) {
+            Some(slot) => Tile { index, ..self.read_tile(*slot)? },
+            None => Tile::empty(index),
+        };
+        let at = if self.tiles.len() < self.capacity {
+            self.tiles.push(tile);
+            self.tiles.len() - 1
+        } else {
+            let at = self.put_oldest_aside()?;
+            self.tiles[at] = tile;
+            at
+        };
+        self.places.insert(index, at);
+        Ok(at)
+    }
+
+    /// Writes the tile that was not used for longest to the scratch file, if it changed; its place is free then.
+    fn put_oldest_aside(&mut self) -> Result<usize> {
+        let oldest = (0..self.tiles.len()).min_by_key(|at| self.tiles[*at].used).unwrap_or(0);
+        let tile = &self.tiles[oldest];
         if tile.dirty {
             let next = self.slots.len() as u64;
-            let slot = *self.slots.entry(index).or_insert(next);
+            let slot = *self.slots.entry(tile.index).or_insert(next);
             let mut bytes = Vec::with_capacity(TILE_BYTES);
             bytes.extend(tile.depth_mm.iter().flat_map(|z| z.to_le_bytes()));
             bytes.extend(tile.weight.iter().flat_map(|w| w.to_le_bytes()));
@@ -356,7 +375,11 @@ impl SurfaceMap {
                 .write_all_at(&bytes, slot * TILE_BYTES as u64)
                 .map_err(|e| Error::io(&self.scratch_path, e))?;
         }
-        Ok(())
+        if tile.changed {
+            self.changed.insert(tile.index);
+        }
+        self.places.remove(&tile.index);
+        Ok(oldest)
     }
 
     fn read_tile(&self, slot: u64) -> Result<Tile> {
@@ -369,6 +392,8 @@ impl SurfaceMap {
         let floats =
             |bytes: &[u8]| bytes.chunks_exact(4).map(|b| f32::from_le_bytes([b[0], b[1], b[2], b[3]])).collect();
         Ok(Tile {
+            index: (0, 0),
+            changed: false,
             depth_mm: floats(depth),
             weight: floats(weight),
             texture: texture.chunks_exact(4).map(|b| [b[0], b[1], b[2], b[3]]).collect(),
@@ -379,8 +404,10 @@ impl SurfaceMap {
 }
 
 impl Tile {
-    fn empty() -> Tile {
+    fn empty(index: TileIndex) -> Tile {
         Tile {
+            index,
+            changed: false,
             depth_mm: vec![f32::NAN; TILE_PX],
             weight: vec![0.0; TILE_PX],
             texture: vec![[0; 4]; TILE_PX],

@@ -199,7 +199,8 @@ impl Run<'_, '_, '_, '_> {
     fn add(&mut self, placed: impl IntoIterator<Item = Placed<Cargo>>) -> Result<()> {
         for frame in placed {
             self.quality.add(&frame, &frame.measured.cargo.stripe);
-            self.timings.time("products", || self.products.add(&frame, self.progress))?;
+            let events = self.timings.time("products", || self.products.add(&frame))?;
+            events.into_iter().try_for_each(|event| self.progress.send(event))?;
         }
         Ok(())
     }

@@ -9,6 +9,7 @@ use std::path::{Path, PathBuf};
 use std::sync::Once;
 
 pub use encoded::{EncodedFrames, encoded_frames};
+pub(crate) use image::shrunk;
 pub use image::{Image, PlaneView, Yuv};
 
 use crate::error::{Error, Result};

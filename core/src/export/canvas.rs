@@ -56,7 +56,7 @@ impl Canvas {
         if inside {
             let pixel = &mut self.pixels[y as usize * self.width_px + x as usize];
             for (old, new) in pixel.iter_mut().zip(colour) {
-                *old = (f32::from(*old) + (f32::from(new) - f32::from(*old)) * alpha.clamp(0.0, 1.0)).round() as u8;
+                *old = (f32::from(*old) + (f32::from(new) - f32::from(*old)) * alpha.clamp(0.0, 1.0) + 0.5) as u8;
             }
         }
     }
@@ -129,7 +129,7 @@ impl Canvas {
         let mut encoder = Encoder::new(&mut file, self.width_px as u32, self.height_px as u32);
         encoder.set_color(ColorType::Rgb);
         encoder.set_depth(BitDepth::Eight);
-        encoder.set_compression(Compression::Balanced);
+        encoder.set_compression(Compression::Fast);
         let mut writer = encoder.write_header().map_err(refused)?;
         writer.write_image_data(self.rgb()).map_err(refused)?;
         writer.finish().map_err(refused)?;

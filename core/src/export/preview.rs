@@ -48,21 +48,42 @@ struct Range {
     far_mm: f64,
 }
 
-/// Writes the picture to `path`.
-///
-/// # Errors
-/// An empty map; what the reading of the map or the disk says.
-pub fn write(map: &mut dyn MapReader, path: &Path, text: &PreviewText) -> Result<()> {
-    paint(map, text)?.save_png(path)
+/// The picture in memory.
+pub struct Picture {
+    canvas: Canvas,
 }
 
-/// The picture in memory: width and height, px, and red, green, blue of each pixel.
+impl Picture {
+    /// Columns.
+    pub fn width_px(&self) -> usize {
+        self.canvas.width_px
+    }
+
+    /// Rows.
+    pub fn height_px(&self) -> usize {
+        self.canvas.height_px
+    }
+
+    /// Red, green, blue of each pixel.
+    pub fn rgb(&self) -> &[u8] {
+        self.canvas.rgb()
+    }
+
+    /// Writes it as a PNG file.
+    ///
+    /// # Errors
+    /// What the disk says.
+    pub fn save(&self, path: &Path) -> Result<()> {
+        self.canvas.save_png(path)
+    }
+}
+
+/// Paints the picture.
 ///
 /// # Errors
 /// An empty map; what the reading of the map says.
-pub fn picture(map: &mut dyn MapReader, text: &PreviewText) -> Result<(usize, usize, Vec<u8>)> {
-    let canvas = paint(map, text)?;
-    Ok((canvas.width_px, canvas.height_px, canvas.rgb().to_vec()))
+pub fn picture(map: &mut dyn MapReader, text: &PreviewText) -> Result<Picture> {
+    paint(map, text).map(|canvas| Picture { canvas })
 }
 
 fn paint(map: &mut dyn MapReader, text: &PreviewText) -> Result<Canvas> {
@@ -89,6 +110,7 @@ fn colour_range(map: &Reduced) -> Option<Range> {
 fn draw_map(canvas: &mut Canvas, layout: &Layout, map: &Reduced, range: Option<Range>) {
     let range = range.unwrap_or(Range { near_mm: 0.0, far_mm: 1.0 });
     let shades = relief::shade(map);
+    let ramp = colour::Ramp::new();
     let scale = layout.mm_per_px / map.mm_per_px;
     for strip in 0..layout.strips {
         let (left, top) = (layout.strip_left_px() as i64, layout.strip_top_px(strip) as i64);
@@ -105,7 +127,7 @@ fn draw_map(canvas: &mut Canvas, layout: &Layout, map: &Reduced, range: Option<R
                 }
                 let share = (f64::from(z_mm) - range.near_mm) / (range.far_mm - range.near_mm);
                 let shade = Reduced::at(&shades, map.width_px, map.height_px, x, y);
-                canvas.blend(at_x, at_y, colour::shaded(colour::ramp(share), shade), 1.0);
+                canvas.blend(at_x, at_y, colour::shaded(ramp.at(share), shade), 1.0);
             }
         }
     }

@@ -2,57 +2,64 @@
 
 use std::collections::VecDeque;
 use std::sync::Arc;
+use std::sync::mpsc::{Receiver, SyncSender, channel, sync_channel};
+use std::thread::{Scope, ScopedJoinHandle};
+use std::time::{Duration, Instant};
 
 use super::colours::ColourFinder;
 use super::poses::Poses;
 use super::reading::{self, Seen};
 use super::recent::{Recent, RecentFrames};
-use super::{Cargo, Colours, Picture, Run};
+use super::{Cargo, Colours, Event, Picture, Products, QualityCounter, Run};
 use crate::depth_map::sheet::WallColours;
-use crate::error::Result;
+use crate::error::{Error, Result};
 use crate::motion::metric::SettledPose;
-use crate::source::Source;
+use crate::source::{Image, Source};
 use crate::stripe::metric::stripe_stages;
 use crate::surface::{Measured, Placed};
 use crate::triangulation::triangulate;
 
+/// Placed frames that may wait for being written.
+const FRAMES_WAIT: usize = 16;
 /// Pictures for the recording that may wait for their frame's pose: they are large.
 const MAX_PICTURES: usize = 12;
 
 /// The order of the stages, frame by frame.
 pub(super) fn measure(run: &mut Run<'_, '_, '_, '_>, source: Box<dyn Source>) -> Result<()> {
-    let (rig, recipe) = (&run.request.rig, &run.request.recipe);
-    let (colours_wanted, between) = (run.products.wants_colours(), run.products.wants_wall_colours());
-    let mut poses = Poses::new(run.request)?;
+    let Run { request, products, quality, progress, timings } = run;
+    let (rig, recipe) = (&request.rig, &request.recipe);
+    let (colours_wanted, between) = (products.wants_colours(), products.wants_wall_colours());
+    let mut pictures = products.wants_pictures().then(|| Pictures::new(recipe.recording.images_per_s));
+    let mut poses = Poses::new(request)?;
     let mut recent = RecentFrames::default();
     let mut waiting = WaitingFrames::default();
     let mut colours = ColourFinder::new(!between);
     std::thread::scope(|scope| {
-        // Source ▶ Frame ▶ the line as the frame alone shows it, in a thread of their own.
+        // Surface ▶ maps, cloud, recording, archive, in a thread of their own.
+        let writer = Writer::start(scope, products, quality);
+        // Source ▶ Frame ▶ the line as the frame alone shows it, in two more.
         let (mut finder, mut measurer) = stripe_stages(&rig.laser, &recipe.spot);
         let (frames, reading) =
             reading::start(scope, source, rig, recipe, move |frame| Ok(finder.see(frame.image.yuv())));
         for seen in frames {
             let Seen { frame, found } = seen?;
             // Frame + line ▶ motion, against the surface measured so far.
-            let plain = run.timings.time("triangulation", || triangulate(&found.stripe, rig));
+            let plain = timings.time("triangulation", || triangulate(&found.stripe, rig));
             let (motion, moved_px) =
-                run.timings.time("motion", || poses.track(&frame, &found.stripe, &plain, found.width_px()));
+                timings.time("motion", || poses.track(&frame, &found.stripe, &plain, found.width_px()));
             // Line + the wall without it ▶ Stripe ▶ Profile.
             let positions = found.stripe.across_px.len();
             let pose = motion.camera_from_world;
             let wall = pose.and_then(|pose| recent.wall(rig, &plain, &pose, positions, found.reach_px()));
-            let stripe = run.timings.time("stripe", || measurer.measure(found, wall.as_ref().map(|(_, wall)| wall)));
-            let profile = run.timings.time("triangulation", || triangulate(&stripe, rig));
-            run.products.stripe(&stripe)?;
-            let image = Arc::new(frame.image);
-            let picture = run.products.wants_picture(frame.time_s) && waiting.pictures() < MAX_PICTURES;
-            let picture = picture.then(|| Picture { image: image.clone(), effective_area: None, row_threshold: None });
+            let stripe = timings.time("stripe", || measurer.measure(found, wall.as_ref().map(|(_, wall)| wall)));
+            let profile = timings.time("triangulation", || triangulate(&stripe, rig));
             // The wall's colours, from a frame that shows it without the laser: an earlier one, or else a later one.
             if colours_wanted && let Some(pose) = pose {
                 let earlier = wall.map(|(recent, _)| recent);
-                run.timings.time("texture", || colours.add(frame.index, rig, &profile, &pose, earlier));
+                timings.time("texture", || colours.add(frame.index, rig, &profile, &pose, earlier));
             }
+            let image = Arc::new(frame.image);
+            let picture = pictures.as_mut().and_then(|pictures| pictures.take(frame.time_s, &image, &waiting));
             let cargo = Cargo { stripe, colours: Colours::Unknown, picture };
             let measured = Measured { frame: frame.index, time_s: frame.time_s, profile, shift: motion.shift, cargo };
             match pose {
@@ -61,24 +68,96 @@ pub(super) fn measure(run: &mut Run<'_, '_, '_, '_>, source: Box<dyn Source>) ->
             }
             waiting.push(measured);
             if let Some(newest) = recent.newest() {
-                run.timings.time("texture", || colours.add_late(rig, newest));
+                timings.time("texture", || colours.add_late(rig, newest));
             }
             for (frame, wall) in colours.take_done() {
                 waiting.colour(frame, wall);
             }
             // Poses that are final ▶ surface.
-            let settled = poses.take_settled();
-            run.add(waiting.place(settled))?;
-            run.progress.frame()?;
+            if !writer.add(waiting.place(poses.take_settled())) {
+                break;
+            }
+            writer.events().try_for_each(|event| progress.send(event))?;
+            progress.frame()?;
         }
-        run.timings.time("motion", || poses.finish());
-        let settled = poses.take_settled();
-        run.add(waiting.place(settled))?;
+        timings.time("motion", || poses.finish());
+        writer.add(waiting.place(poses.take_settled()));
+        let (time, events) = writer.finish()?;
+        timings.add("products", time);
+        events.into_iter().try_for_each(|event| progress.send(event))?;
         let report = reading.join()?;
-        run.timings.add("decoding", report.decoding);
-        run.timings.add("stripe", report.stripes);
-        report.warnings.into_iter().chain(poses.warnings()).try_for_each(|warning| run.progress.warn(warning))
+        timings.add("decoding", report.decoding);
+        timings.add("stripe", report.stripes);
+        report.warnings.into_iter().chain(poses.warnings()).try_for_each(|warning| progress.warn(warning))
     })
+}
+
+/// The thread that adds placed frames to the products.
+struct Writer<'scope> {
+    frames: SyncSender<Placed<Cargo>>,
+    events: Receiver<Event>,
+    thread: ScopedJoinHandle<'scope, Result<Duration>>,
+}
+
+impl<'scope> Writer<'scope> {
+    fn start<'r: 'scope>(
+        scope: &'scope Scope<'scope, '_>,
+        products: &'scope mut Products<'r>,
+        quality: &'scope mut QualityCounter,
+    ) -> Writer<'scope> {
+        let (frames, placed) = sync_channel::<Placed<Cargo>>(FRAMES_WAIT);
+        let (say, events) = channel();
+        let thread = scope.spawn(move || {
+            let mut time = Duration::ZERO;
+            for frame in placed {
+                let start = Instant::now();
+                quality.add(&frame, &frame.measured.cargo.stripe);
+                let events = products.add(&frame)?;
+                time += start.elapsed();
+                // Nobody listens only after a cancel, which has said its own.
+                events.into_iter().for_each(|event| drop(say.send(event)));
+            }
+            Ok(time)
+        });
+        Writer { frames, events, thread }
+    }
+
+    /// Hands frames over; false where the thread has ended, with an error that [`Writer::finish`] tells.
+    fn add(&self, placed: Vec<Placed<Cargo>>) -> bool {
+        placed.into_iter().all(|frame| self.frames.send(frame).is_ok())
+    }
+
+    /// What there is to say since this was last asked.
+    fn events(&self) -> impl Iterator<Item = Event> + '_ {
+        self.events.try_iter()
+    }
+
+    /// Waits until all is written: the time that took, and what is left to say.
+    fn finish(self) -> Result<(Duration, Vec<Event>)> {
+        drop(self.frames);
+        let time = self.thread.join().map_err(|_| Error::internal("products", "the writing thread panicked"))??;
+        Ok((time, self.events.try_iter().collect()))
+    }
+}
+
+/// Which frames' pictures are kept for the recording.
+struct Pictures {
+    interval_s: f64,
+    next_s: f64,
+}
+
+impl Pictures {
+    fn new(images_per_s: f64) -> Pictures {
+        Pictures { interval_s: 1.0 / images_per_s, next_s: 0.0 }
+    }
+
+    fn take(&mut self, time_s: f64, image: &Arc<Image>, waiting: &WaitingFrames) -> Option<Picture> {
+        if time_s + 1e-9 < self.next_s || waiting.pictures() >= MAX_PICTURES {
+            return None;
+        }
+        self.next_s = time_s + self.interval_s;
+        Some(Picture { image: image.clone(), effective_area: None, row_threshold: None })
+    }
 }
 
 /// Frames in their order, until their poses are final.

@@ -34,7 +34,6 @@ pub(super) fn measure(run: &mut Run<'_, '_, '_, '_>, source: Box<dyn Source>) ->
             let profile = run.timings.time("triangulation", || triangulate(&steps.stripe, rig));
             // Frames ▶ motion.
             let shift = run.timings.time("motion", || tracker.track(&frame, &steps.stripe))?;
-            run.products.stripe(&steps.stripe)?;
             // Profile + motion ▶ surface. A frame's strip ends where the next one begins: it waits for that.
             let step_px = shift.travel_px(rig.laser.line);
             if let Some(before) = held.take() {

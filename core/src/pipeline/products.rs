@@ -15,7 +15,7 @@ use crate::export::manifest::{
     FileEntry, Gap, GrayScale, Manifest, Quality, SCHEMA_VERSION, list_products, sha256_of_bytes,
 };
 use crate::export::npy::NpyWriter;
-use crate::export::preview::{self, PreviewText};
+use crate::export::preview::{self, Picture, PreviewText};
 use crate::export::tiles::{TileGrid, TileWriter};
 use crate::export::trajectory_csv::{TrajectoryRow, TrajectoryWriter};
 use crate::export::{depth_png, depth_tif, texture};
@@ -23,7 +23,6 @@ use crate::motion::track::TrackUse;
 use crate::recording::{FrameSteps, RecordedRun, Recorder, Segment};
 use crate::rig::{LineDirection, Rig};
 use crate::source::{SourceInfo, encoded_frames};
-use crate::stripe::Stripe;
 use crate::surface::{Placed, SurfacePoint};
 
 /// Where live recording segments lie in the product folder; they are no products.
@@ -88,6 +87,11 @@ impl<'a> Products<'a> {
         self.recorder.as_ref().is_some_and(|recorder| recorder.wants_image(time_s))
     }
 
+    /// Whether any product shows the frames themselves.
+    pub(super) fn wants_pictures(&self) -> bool {
+        self.recorder.is_some()
+    }
+
     /// Whether any product shows the wall's colours.
     pub(super) fn wants_colours(&self) -> bool {
         // The depth maps alone, the trajectory and the stripes have none.
@@ -103,17 +107,15 @@ impl<'a> Products<'a> {
         self.request.products.iter().any(shows)
     }
 
-    /// Keeps a stripe, in the order of the frames.
-    pub(super) fn stripe(&mut self, stripe: &Stripe) -> Result<()> {
-        self.stripes.as_mut().map_or(Ok(()), |file| file.push_row(&stripe.across_px))
-    }
-
-    /// Adds a placed frame to everything that grows.
-    pub(super) fn add(&mut self, placed: &Placed<Cargo>, progress: &mut Progress<'_, '_>) -> Result<()> {
+    /// Adds a placed frame, in the order of the frames, to everything that grows; says what can be shown now.
+    pub(super) fn add(&mut self, placed: &Placed<Cargo>) -> Result<Vec<Event>> {
         let (measured, cargo) = (&placed.measured, &placed.measured.cargo);
         self.frames += 1;
         let points = surface_points(placed);
         self.add_to_map(placed, &points)?;
+        if let Some(stripes) = &mut self.stripes {
+            stripes.push_row(&cargo.stripe.across_px)?;
+        }
         if let Some(trajectory) = &mut self.trajectory {
             trajectory.push(&trajectory_row(placed))?;
         }
@@ -128,8 +130,9 @@ impl<'a> Products<'a> {
             archive.surface(measured.time_s, &points)?;
             archive.measurement(measured.frame, measured.time_s, &cargo.stripe, &measured.shift)?;
         }
+        let mut events = Vec::new();
         if let Some(recorder) = &mut self.recorder {
-            let picture = cargo.picture.as_ref();
+            let picture = cargo.picture.as_ref().filter(|_| recorder.wants_image(measured.time_s));
             let segments = recorder.log_frame(&FrameSteps {
                 frame_index: measured.frame,
                 time_s: measured.time_s,
@@ -141,9 +144,10 @@ impl<'a> Products<'a> {
                 world_from_camera: placed.world_from_camera,
                 points: &points,
             })?;
-            self.announce(segments, progress)?;
+            events = self.announcements(segments);
         }
-        self.write_changed_tiles()
+        self.write_changed_tiles()?;
+        Ok(events)
     }
 
     fn add_to_map(&mut self, placed: &Placed<Cargo>, points: &[SurfacePoint]) -> Result<()> {
@@ -215,13 +219,13 @@ impl<'a> Products<'a> {
         Ok(())
     }
 
-    fn announce(&self, segments: Vec<Segment>, progress: &mut Progress<'_, '_>) -> Result<()> {
-        for segment in segments {
+    fn announcements(&self, segments: Vec<Segment>) -> Vec<Event> {
+        let event = |segment: Segment| {
             let path = segment.path.strip_prefix(&self.request.out_dir).unwrap_or(&segment.path);
             let path = path.to_string_lossy().into_owned();
-            progress.send(Event::Segment { number: segment.number, path, bytes: segment.bytes })?;
-        }
-        Ok(())
+            Event::Segment { number: segment.number, path, bytes: segment.bytes }
+        };
+        segments.into_iter().map(event).collect()
     }
 
     /// Writes what is written at the end, and the manifest last.
@@ -239,7 +243,7 @@ impl<'a> Products<'a> {
         let coverage = finished.as_ref().map_or(0.0, FinishedMap::coverage);
         let (quality, gaps, resolution) = quality.finish(&request.rig, coverage);
         warn_of_quality(&quality, &gaps, request, progress)?;
-        let gray = timings.time("maps", || self.write_maps(finished.as_mut(), progress))?;
+        let (gray, picture) = timings.time("maps", || self.write_maps(finished.as_mut(), progress))?;
         if let Some(trajectory) = self.trajectory.take() {
             progress.step("trajectory")?;
             trajectory.finish()?;
@@ -271,7 +275,7 @@ impl<'a> Products<'a> {
             products: Vec::new(),
         };
         let archived = timings.time("archive", || self.finish_archive(&manifest, finished.as_mut(), progress))?;
-        timings.time("recording", || self.finish_recording(finished.as_mut(), progress))?;
+        timings.time("recording", || self.finish_recording(picture, progress))?;
         if let Some(warning) = archived {
             progress.warn(warning)?;
         }
@@ -284,38 +288,52 @@ impl<'a> Products<'a> {
         Ok(manifest)
     }
 
+    /// Writes the maps, two at a time: both halves squeeze the whole map, each on its own core. Returns the gray values
+    /// of `depth.png`, and the picture for people.
     fn write_maps(
         &mut self,
         map: Option<&mut FinishedMap<'_>>,
         progress: &mut Progress<'_, '_>,
-    ) -> Result<Option<GrayScale>> {
-        let Some(map) = map else { return Ok(None) };
+    ) -> Result<(Option<GrayScale>, Option<Picture>)> {
+        let Some(map) = map else { return Ok((None, None)) };
         let (folder, wanted) = (&self.request.out_dir, &self.request.products);
-        let mut gray = None;
-        if wanted.contains(&ProductGroup::Depth) {
-            progress.step("depth")?;
-            // Both squeeze the whole map: at the same time, each on its own core.
-            let shared = SharedMap::new(map);
-            gray = std::thread::scope(|scope| {
-                let tif = scope.spawn(|| depth_tif::write(&mut shared.reader(), &folder.join("depth.tif")));
-                let gray = depth_png::write(&mut shared.reader(), folder);
-                tif.join().map_err(|_| Error::internal("depth.tif", "its thread panicked"))??;
-                gray
-            })?;
-        }
-        if wanted.contains(&ProductGroup::Texture) {
-            progress.step("texture")?;
-            texture::write(map, folder)?;
-        }
-        if wanted.contains(&ProductGroup::Preview) {
-            progress.step("preview")?;
-            preview::write(map, &folder.join("preview.png"), &self.preview_text())?;
-        }
-        if let Some(tiles) = self.tiles.take() {
-            progress.step("tiles")?;
-            tiles.finish(map)?;
-        }
-        Ok(gray)
+        let wants = |group| wanted.contains(&group);
+        let text = self.preview_text();
+        let tiles = self.tiles.take();
+        let shared = SharedMap::new(map);
+        std::thread::scope(|scope| {
+            let beside = scope.spawn(|| -> Result<Option<Picture>> {
+                if wants(ProductGroup::Depth) {
+                    depth_tif::write(&mut shared.reader(), &folder.join("depth.tif"))?;
+                }
+                if !wants(ProductGroup::Preview) && !wants(ProductGroup::Recording) {
+                    return Ok(None);
+                }
+                let picture = preview::picture(&mut shared.reader(), &text)?;
+                if wants(ProductGroup::Preview) {
+                    picture.save(&folder.join("preview.png"))?;
+                }
+                Ok(Some(picture))
+            });
+            let mut gray = None;
+            if wants(ProductGroup::Depth) {
+                progress.step("depth")?;
+                gray = depth_png::write(&mut shared.reader(), folder)?;
+            }
+            if wants(ProductGroup::Texture) {
+                progress.step("texture")?;
+                texture::write(&mut shared.reader(), folder)?;
+            }
+            if let Some(tiles) = tiles {
+                progress.step("tiles")?;
+                tiles.finish(&mut shared.reader())?;
+            }
+            if wants(ProductGroup::Preview) {
+                progress.step("preview")?;
+            }
+            let picture = beside.join().map_err(|_| Error::internal("maps", "a thread panicked"))??;
+            Ok((gray, picture))
+        })
     }
 
     fn preview_text(&self) -> PreviewText {
@@ -361,18 +379,17 @@ impl<'a> Products<'a> {
         Ok(lost)
     }
 
-    fn finish_recording(&mut self, map: Option<&mut FinishedMap<'_>>, progress: &mut Progress<'_, '_>) -> Result<()> {
+    fn finish_recording(&mut self, picture: Option<Picture>, progress: &mut Progress<'_, '_>) -> Result<()> {
         let Some(mut recorder) = self.recorder.take() else { return Ok(()) };
         progress.step("recording")?;
-        if let Some(map) = map {
-            let (width_px, height_px, rgb) = preview::picture(map, &self.preview_text())?;
-            recorder.log_map(width_px as u32, height_px as u32, &rgb)?;
+        if let Some(picture) = picture {
+            recorder.log_map(picture.width_px() as u32, picture.height_px() as u32, picture.rgb())?;
         }
         for warning in progress.warnings().to_vec() {
             recorder.log_warning(&warning)?;
         }
         let segments = recorder.finish()?;
-        self.announce(segments, progress)
+        self.announcements(segments).into_iter().try_for_each(|event| progress.send(event))
     }
 }
 

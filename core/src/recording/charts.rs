@@ -141,15 +141,15 @@ impl Curve {
 /// Equation (7) around the spot.
 fn gray_curve(image: &Image, line: LineDirection, position: usize, across_px: f32) -> Curve {
     let (width, height) = (image.width_px() as usize, image.height_px() as usize);
-    let (length, index): (usize, &dyn Fn(usize) -> usize) = match line {
-        LineDirection::Vertical => (width, &|across| position * width + across),
-        LineDirection::Horizontal => (height, &|across| across * width + position),
+    let (length, place): (usize, &dyn Fn(usize) -> (usize, usize)) = match line {
+        LineDirection::Vertical => (width, &|across| (across, position)),
+        LineDirection::Horizontal => (height, &|across| (position, across)),
     };
     let spot = (across_px.max(0.0) as usize).min(length - 1);
     let (first, last) = (spot.saturating_sub(HALF_WINDOW_PX), (spot + HALF_WINDOW_PX).min(length - 1));
-    let gray = |across: usize| match image.bgr().get(3 * index(across)..3 * index(across) + 3) {
-        Some([b, g, r]) => 0.299 * f32::from(*r) + 0.587 * f32::from(*g) + 0.114 * f32::from(*b),
-        _ => 0.0,
+    let gray = |across: usize| match image.bgr_at(place(across).0, place(across).1) {
+        Some([b, g, r]) => 0.299 * f32::from(r) + 0.587 * f32::from(g) + 0.114 * f32::from(b),
+        None => 0.0,
     };
     Curve { first_px: first, gray: (first..=last).map(gray).collect() }
 }

@@ -11,7 +11,7 @@ use crate::error::{Error, Result};
 use crate::geometry::RawPixel;
 use crate::recipe::RecordingOptions;
 use crate::rig::{LaserColour, Rig};
-use crate::source::Image;
+use crate::source::{Image, shrunk};
 use crate::stripe::Stripe;
 
 const FRAME_QUALITY: u8 = 80;
@@ -96,7 +96,7 @@ impl Images {
     pub(super) fn show(&mut self, steps: &FrameSteps<'_>, image: &Image, share: &mut Share) -> Result<Vec<Chunk>> {
         let at = steps.moment();
         self.last_s = Some(at.time_s);
-        let small = shrunk::<3>(image.bgr(), image.width_px() as usize, self.shrink);
+        let small = image.shrunk_bgr(self.shrink);
         let mut jpegs = vec![(entity::IMAGE, self.jpeg(&small, FRAME_QUALITY)?)];
         if let Some(mask) = steps.effective_area {
             jpegs.push((entity::AREA, self.jpeg(&self.effective_area(small, image, mask)?, AREA_QUALITY)?));
@@ -182,35 +182,6 @@ pub(super) fn jpeg(pixels: &[u8], width_px: u32, height_px: u32, colours: ColorT
 fn profile(steps: &FrameSteps<'_>) -> Points3D {
     let step = steps.points.len().div_ceil(PROFILE_POINTS).max(1);
     Points3D::update_fields().with_positions(steps.points.iter().step_by(step).map(|p| metres(&p.point_in_world)))
-}
-
-/// Each pixel of the result is the mean of `factor` x `factor` pixels of `CHANNELS` bytes; what is left over at the
-/// right and the bottom is cut off.
-fn shrunk<const CHANNELS: usize>(pixels: &[u8], width: usize, factor: usize) -> Vec<u8> {
-    if factor == 1 {
-        return pixels.to_vec();
-    }
-    let columns = width / factor;
-    let mut out = Vec::with_capacity(columns * CHANNELS * (pixels.len() / (width * CHANNELS) / factor));
-    // Columns of `factor` pixels first, many at once; then their sums side by side. The division by the area is a
-    // multiplication: it is exact for all sums that can occur, and several times faster.
-    let area = (factor * factor) as u64;
-    let reciprocal = (1u64 << 40).div_ceil(area);
-    let mut sums = vec![0u16; width * CHANNELS];
-    for rows in pixels.chunks_exact(width * CHANNELS * factor) {
-        sums.fill(0);
-        for row in rows.chunks_exact(width * CHANNELS) {
-            sums.iter_mut().zip(row).for_each(|(sum, value)| *sum += u16::from(*value));
-        }
-        for block in sums.chunks_exact(CHANNELS * factor).take(columns) {
-            let mut total = [area / 2; CHANNELS];
-            for pixel in block.chunks_exact(CHANNELS) {
-                total.iter_mut().zip(pixel).for_each(|(total, sum)| *total += u64::from(*sum));
-            }
-            out.extend(total.map(|total| ((total * reciprocal) >> 40) as u8));
-        }
-    }
-    out
 }
 
 #[cfg(test)]

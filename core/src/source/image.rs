@@ -69,6 +69,53 @@ impl Image {
         })
     }
 
+    /// Blue, green, red of one pixel: from the colours where they are there already, else from its luma and the nearest
+    /// chroma. `None` outside the image.
+    pub fn bgr_at(&self, column: usize, row: usize) -> Option<[u8; 3]> {
+        if column >= self.width_px as usize || row >= self.height_px as usize {
+            return None;
+        }
+        if let Some(bgr) = self.bgr.get() {
+            let at = 3 * (row * self.width_px as usize + column);
+            return Some([bgr[at], bgr[at + 1], bgr[at + 2]]);
+        }
+        let [red, green, blue] = self.yuv().rgb(column, row);
+        Some([blue, green, red])
+    }
+
+    /// The image with each `factor` by `factor` pixels as one, blue, green, red: for people to look at. What does not
+    /// fill a whole pixel at the right and below is left out. Full-size colours are not made for it.
+    pub fn shrunk_bgr(&self, factor: usize) -> Vec<u8> {
+        let factor = factor.max(1);
+        if let Some(bgr) = self.bgr.get() {
+            return shrunk::<3>(bgr, self.width_px as usize, factor);
+        }
+        let yuv = self.yuv();
+        let (width, height) = (yuv.width_px() / factor, yuv.height_px() / factor);
+        let (shift_x, shift_y) = yuv.chroma_shifts();
+        let mut bgr = Vec::with_capacity(3 * width * height);
+        let mut sums = vec![0u32; width * factor];
+        let area = (factor * factor) as u32;
+        for row in 0..height {
+            sums.fill(0);
+            for k in 0..factor {
+                let luma = &yuv.y.data[(row * factor + k) * yuv.y.stride_bytes..][..width * factor];
+                sums.iter_mut().zip(luma).for_each(|(sum, value)| *sum += u32::from(*value));
+            }
+            let chroma_row = (row * factor + factor / 2) >> shift_y;
+            for (column, block) in sums.chunks_exact(factor).enumerate() {
+                let luma = (block.iter().sum::<u32>() + area / 2) / area;
+                let at = (column * factor + factor / 2) >> shift_x;
+                let (u, v) = (
+                    yuv.u.data[chroma_row * yuv.u.stride_bytes + at],
+                    yuv.v.data[chroma_row * yuv.v.stride_bytes + at],
+                );
+                bgr.extend(yuv.colours.bgr(luma as u8, u, v));
+            }
+        }
+        bgr
+    }
+
     /// Luma and chroma as the decoder gave them; made from the colours where the source gave those.
     pub fn yuv(&self) -> Yuv<'_> {
         match &self.given {
@@ -208,6 +255,35 @@ fn own_planes(width: usize, height: usize, bgr: &[u8]) -> OwnPlanes {
         }
     }
     OwnPlanes { format, y, u, v }
+}
+
+/// Each pixel of the result is the mean of `factor` x `factor` pixels of `CHANNELS` bytes; what is left over at the
+/// right and the bottom is cut off.
+pub(crate) fn shrunk<const CHANNELS: usize>(pixels: &[u8], width: usize, factor: usize) -> Vec<u8> {
+    if factor == 1 {
+        return pixels.to_vec();
+    }
+    let columns = width / factor;
+    let mut out = Vec::with_capacity(columns * CHANNELS * (pixels.len() / (width * CHANNELS) / factor));
+    // Columns of `factor` pixels first, many at once; then their sums side by side. The division by the area is a
+    // multiplication: it is exact for all sums that can occur, and several times faster.
+    let area = (factor * factor) as u64;
+    let reciprocal = (1u64 << 40).div_ceil(area);
+    let mut sums = vec![0u16; width * CHANNELS];
+    for rows in pixels.chunks_exact(width * CHANNELS * factor) {
+        sums.fill(0);
+        for row in rows.chunks_exact(width * CHANNELS) {
+            sums.iter_mut().zip(row).for_each(|(sum, value)| *sum += u16::from(*value));
+        }
+        for block in sums.chunks_exact(CHANNELS * factor).take(columns) {
+            let mut total = [area / 2; CHANNELS];
+            for pixel in block.chunks_exact(CHANNELS) {
+                total.iter_mut().zip(pixel).for_each(|(total, sum)| *total += u64::from(*sum));
+            }
+            out.extend(total.map(|total| ((total * reciprocal) >> 40) as u8));
+        }
+    }
+    out
 }
 
 /// Which weights of red and blue make the luma: ITU-R BT.601, BT.709 or BT.2020.

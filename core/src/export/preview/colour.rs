@@ -40,7 +40,7 @@ fn srgb_from_oklab(lightness: f64, a: f64, b: f64) -> Rgb {
 fn encode_srgb(linear: f64) -> u8 {
     let linear = linear.clamp(0.0, 1.0);
     let encoded = if linear <= 0.003_130_8 { 12.92 * linear } else { 1.055 * linear.powf(1.0 / 2.4) - 0.055 };
-    (encoded * 255.0).round() as u8
+    (encoded * 255.0 + 0.5) as u8
 }
 
 /// A colour in light (`shade` up to 1) or shadow (down to −1).
@@ -48,8 +48,26 @@ pub(super) fn shaded(colour: Rgb, shade: f32) -> Rgb {
     colour.map(|channel| {
         let value = f32::from(channel);
         let lit = if shade < 0.0 { value * (1.0 + 0.62 * shade) } else { value + (255.0 - value) * 0.55 * shade };
-        lit.round() as u8
+        (lit + 0.5) as u8
     })
+}
+
+/// The ramp in steps finer than a picture shows: a colour for each pixel would take longer than all the rest.
+pub(super) struct Ramp {
+    colours: Vec<Rgb>,
+}
+
+impl Ramp {
+    const STEPS: usize = 2048;
+
+    pub(super) fn new() -> Ramp {
+        Ramp { colours: (0..=Ramp::STEPS).map(|i| ramp(i as f64 / Ramp::STEPS as f64)).collect() }
+    }
+
+    /// The colour at a share from 0 (near) to 1 (far); beyond, that of the end.
+    pub(super) fn at(&self, share: f64) -> Rgb {
+        self.colours[(share.clamp(0.0, 1.0) * Ramp::STEPS as f64 + 0.5) as usize]
+    }
 }
 
 #[cfg(test)]

@@ -49,10 +49,10 @@ impl Reduced {
     /// The depth at a place between the pixels, NaN where its nearest pixel was not measured.
     pub(super) fn at(values: &[f32], width_px: usize, height_px: usize, x: f64, y: f64) -> f32 {
         let (x, y) = (x.clamp(0.0, (width_px - 1) as f64), y.clamp(0.0, (height_px - 1) as f64));
-        if values[y.round() as usize * width_px + x.round() as usize].is_nan() {
+        if values[(y + 0.5) as usize * width_px + (x + 0.5) as usize].is_nan() {
             return f32::NAN;
         }
-        let (left, top) = (x.floor() as usize, y.floor() as usize);
+        let (left, top) = (x as usize, y as usize);
         let (part_x, part_y) = ((x - left as f64) as f32, (y - top as f64) as f32);
         let (mut sum, mut weights) = (0.0, 0.0);
         for (column, row, weight) in [
@@ -71,10 +71,12 @@ impl Reduced {
 
     /// The depths below and above which a share `tail` lies, mm; `None` where nothing was measured.
     pub(super) fn range_mm(&self, tail: f64) -> Option<(f64, f64)> {
-        let mut sorted: Vec<f32> = self.depth_mm.iter().copied().filter(|z| z.is_finite()).collect();
-        sorted.sort_unstable_by(f32::total_cmp);
-        let last = sorted.len().checked_sub(1)?;
-        let at = |share: f64| f64::from(sorted[(share * last as f64).round() as usize]);
+        let mut finite: Vec<f32> = self.depth_mm.iter().copied().filter(|z| z.is_finite()).collect();
+        let last = finite.len().checked_sub(1)?;
+        let mut at = |share: f64| {
+            let index = (share * last as f64).round() as usize;
+            f64::from(*finite.select_nth_unstable_by(index, f32::total_cmp).1)
+        };
         Some((at(tail), at(1.0 - tail)))
     }
 }

@@ -29,7 +29,7 @@ fn near_is_light_far_is_dark_and_holes_are_hatched() {
         300..600 => (f32::NAN, None),
         _ => (850.0, None),
     });
-    write(&mut map, &path, &PreviewText::default()).expect("write");
+    picture(&mut map, &PreviewText::default()).expect("picture").save(&path).expect("write");
     let (width, height, pixels) = read(&path);
     assert!(width <= 2000 && height <= 2000, "{width} x {height}");
     let layout = Layout::of(&map.geometry());
@@ -49,7 +49,7 @@ fn a_dent_is_dark_on_the_side_of_the_light() {
         let squared = (c as f32 - 450.0).powi(2) + (r as f32 - 300.0).powi(2);
         (850.0 + 3.0 * (-squared / (2.0 * 40.0_f32.powi(2))).exp(), None)
     });
-    write(&mut map, &path, &PreviewText::default()).expect("write");
+    picture(&mut map, &PreviewText::default()).expect("picture").save(&path).expect("write");
     let (width, _, pixels) = read(&path);
     let layout = Layout::of(&map.geometry());
     let at = |c: f64, r: f64| {
@@ -65,7 +65,8 @@ fn any_size_and_an_unmeasured_map_give_a_picture() {
     let path = folder.path().join("preview.png");
     for (width, height) in [(1, 1), (2, 900), (60_000, 300), (700, 500)] {
         let mut map = GridMap::from_fn(geometry(width, height), |_, _| (f32::NAN, None));
-        write(&mut map, &path, &PreviewText { title: "х".repeat(300), ..PreviewText::default() }).expect("write");
+        let text = PreviewText { title: "х".repeat(300), ..PreviewText::default() };
+        picture(&mut map, &text).expect("picture").save(&path).expect("write");
         assert!(read(&path).0 <= 2000);
     }
 }
