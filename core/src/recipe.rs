@@ -161,13 +161,13 @@ recipe! {
     /// How the camera's pose is found (method `metric`).
     pose: PoseOptions {
         /// Places on the wall that are followed, about; one per cell of a grid over the image.
-        landmarks: u32 = 110, "", whole(12, 2000);
+        landmarks: u32 = 100, "", whole(12, 2000);
         /// Least texture of such a place: the weaker direction's mean squared slope of the luma.
         texture_min: f64 = 0.15, "levels² a px²", number(0.0, 10000.0);
         /// Travel of the image from one key frame to the next, as a share of its width.
         keyframe_share: f64 = 0.1, "of the width", number(0.01, 0.5);
         /// Key frames whose poses are still adjusted together; each frame waits until its key frames are settled.
-        window: u32 = 7, "key frames", whole(2, 30);
+        window: u32 = 5, "key frames", whole(2, 30);
         /// Most frames that wait for that: a robot that stands still must not fill the memory.
         waiting_max: u32 = 600, "frames", whole(2, 10000);
         /// Frames without motion found, one after the other, after which the way is taken to be broken.

@@ -179,12 +179,36 @@ impl Patch {
 
     /// One round: how alike the image is to the patch there, and how far the patch seems to be off.
     fn step(&self, image: Gray<'_>, x: f32, y: f32, seen: &mut [f32; PIXELS]) -> Option<(f32, (f32, f32))> {
+        /// The same with the wider registers of processors since 2013: half of the motion's time is spent here.
+        #[cfg(target_arch = "x86_64")]
+        #[target_feature(enable = "avx2")]
+        fn wide(
+            patch: &Patch,
+            image: Gray<'_>,
+            x: f32,
+            y: f32,
+            seen: &mut [f32; PIXELS],
+        ) -> Option<(f32, (f32, f32))> {
+            patch.step_anywhere(image, x, y, seen)
+        }
+        #[cfg(target_arch = "x86_64")]
+        if std::arch::is_x86_feature_detected!("avx2") {
+            // SAFETY: the processor has what the function is compiled for; it does nothing else that is unsafe.
+            #[allow(unsafe_code)]
+            return unsafe { wide(self, image, x, y, seen) };
+        }
+        self.step_anywhere(image, x, y, seen)
+    }
+
+    #[inline(always)]
+    fn step_anywhere(&self, image: Gray<'_>, x: f32, y: f32, seen: &mut [f32; PIXELS]) -> Option<(f32, (f32, f32))> {
         if !image.holds(x, y, REACH as f32) {
             return None;
         }
-        let (left, top) = (x.floor(), y.floor());
-        let (s, t) = (x - left, y - top);
-        let (left, top) = (left as usize - SIDE / 2, top as usize - SIDE / 2);
+        // Inside the image, so above 0: cutting off is rounding down.
+        let (left, top) = (x as usize, y as usize);
+        let (s, t) = (x - left as f32, y - top as f32);
+        let (left, top) = (left - SIDE / 2, top - SIDE / 2);
         let weights = [(1.0 - s) * (1.0 - t), s * (1.0 - t), (1.0 - s) * t, s * t];
         let mut sum = 0.0;
         for (row, out) in seen.chunks_exact_mut(SIDE).enumerate() {

@@ -113,24 +113,7 @@ impl SpotShape {
         let lanes = ((2.0 * reach) as usize + 1) / LANES + 1;
         let from = ((at - reach).max(0.0) as usize).min(profile.len().checked_sub(lanes * LANES)?);
         let window = &profile[from..from + lanes * LANES];
-        let scale = 1.0 / (reach * reach);
-        let (mut light, mut moment) = ([0.0f32; LANES], [0.0f32; LANES]);
-        // Offsets from the place, and the slope's level there: added to lane by lane.
-        let mut d: [f32; LANES] = std::array::from_fn(|lane| (from + lane) as f32 - at);
-        let level_at = level + slope * at;
-        for chunk in window.chunks_exact(LANES) {
-            for lane in 0..LANES {
-                // (1 − (d/reach)²)⁴ is nearly the bell exp(−4·(d/reach)²), and needs no exponential.
-                let u = 1.0 - d[lane] * d[lane] * scale;
-                let u = if u > 0.0 { u } else { 0.0 };
-                let weight = u * u * (u * u);
-                let weighted = weight * (chunk[lane] - level_at - slope * d[lane]);
-                light[lane] += weighted;
-                moment[lane] += weighted * d[lane];
-                d[lane] += LANES as f32;
-            }
-        }
-        Some((light.iter().sum(), moment.iter().sum()))
+        Some(window_sums(window, from as f32 - at, reach, level + slope * at, slope))
     }
 
     /// What a glint on one side does to the centre, px: the background is not the straight slope that it is taken for.
@@ -174,6 +157,44 @@ impl SpotShape {
         }
         true
     }
+}
+
+/// Sums over whole lanes of samples, the first `first_d` samples from the place: light above `level_at` (at the place)
+/// and a slope, and its moment.
+fn window_sums(window: &[f32], first_d: f32, reach: f32, level_at: f32, slope: f32) -> (f32, f32) {
+    /// The same with the wider registers of processors since 2013: a third of the stripe's time is spent here.
+    #[cfg(target_arch = "x86_64")]
+    #[target_feature(enable = "avx2")]
+    fn wide(window: &[f32], first_d: f32, reach: f32, level_at: f32, slope: f32) -> (f32, f32) {
+        lane_sums(window, first_d, reach, level_at, slope)
+    }
+    #[cfg(target_arch = "x86_64")]
+    if std::arch::is_x86_feature_detected!("avx2") {
+        // SAFETY: the processor has what the function is compiled for; it does nothing else that is unsafe.
+        #[allow(unsafe_code)]
+        return unsafe { wide(window, first_d, reach, level_at, slope) };
+    }
+    lane_sums(window, first_d, reach, level_at, slope)
+}
+
+#[inline(always)]
+fn lane_sums(window: &[f32], first_d: f32, reach: f32, level_at: f32, slope: f32) -> (f32, f32) {
+    let scale = 1.0 / (reach * reach);
+    let (mut light, mut moment) = ([0.0f32; LANES], [0.0f32; LANES]);
+    let mut d: [f32; LANES] = std::array::from_fn(|lane| first_d + lane as f32);
+    for chunk in window.chunks_exact(LANES) {
+        for lane in 0..LANES {
+            // (1 − (d/reach)²)⁴ is nearly the bell exp(−4·(d/reach)²), and needs no exponential.
+            let u = 1.0 - d[lane] * d[lane] * scale;
+            let u = if u > 0.0 { u } else { 0.0 };
+            let weight = u * u * (u * u);
+            let weighted = weight * (chunk[lane] - level_at - slope * d[lane]);
+            light[lane] += weighted;
+            moment[lane] += weighted * d[lane];
+            d[lane] += LANES as f32;
+        }
+    }
+    (light.iter().sum(), moment.iter().sum())
 }
 
 /// Light of a side: the mean without the least and the greatest, which may be specks.
