@@ -10,7 +10,7 @@ use crate::rig::Rig;
 use crate::source::{Frame, Source};
 
 /// Frames that wait between the two threads, at most.
-const FRAMES_WAIT: usize = 3;
+const FRAMES_WAIT: usize = 8;
 
 /// A frame with what was found in it alone.
 pub(super) struct Seen<T> {
