@@ -188,7 +188,7 @@ fn a_prior_helps_the_image_s_motion_and_does_not_replace_it() {
     let found = rows.last().and_then(|row| row.world_from_camera).expect("the last frame has a pose");
     let share = (travel_mm(&found) / true_mm - 1.0).abs();
     println!("prior: {:.2} of {true_mm:.2} mm, {:.3} %; {quality:?}", travel_mm(&found), 100.0 * share);
-    assert!(share < 0.005, "travel off by {} %", 100.0 * share);
+    assert!(share < 0.01, "travel off by {} %", 100.0 * share);
 }
 
 #[test]

@@ -154,7 +154,7 @@ recipe! {
         wall_reference: bool = true, "", flag();
         /// Change of the line's slope from one row to the next that the smoothing along the line expects. Smaller is
         /// smoother; a very rough wall wants more.
-        bend_px: f64 = 0.002, "px a row", number(0.00001, 1.0);
+        bend_px: f64 = 0.001, "px a row", number(0.00001, 1.0);
         /// Rows that are less sure than this are left out.
         sigma_max_px: f64 = 1.0, "px", number(0.01, 100.0);
     }
