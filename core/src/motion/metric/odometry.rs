@@ -43,6 +43,11 @@ const EARLY_KEYFRAMES: usize = 4;
 const EARLY_STEP: f64 = 0.2;
 /// Least and greatest standard deviation of a found place, px.
 const SIGMA_PX: (f64, f64) = (0.04, 1.0);
+/// Median distance of a sight with normal errors in two directions, in standard deviations.
+const MEDIAN_MISFIT: f64 = 1.18;
+/// Largest factor between how well patches seem to be found and how well they are, and how fast it is learned.
+const NOISE_RANGE: f64 = 12.0;
+const NOISE_GAIN: f64 = 0.3;
 /// Sights further off than this many standard deviations are wrong.
 const OUTLIER: f64 = 5.0;
 /// Frames in a row without a landmark that should be there, after which it is given up.
@@ -103,6 +108,8 @@ pub struct Odometry {
     carried: bool,
     carried_frames: u32,
     part: u32,
+    /// How much worse patches are found than they seem to be.
+    noise: f64,
 }
 
 /// The frame before.
@@ -218,6 +225,7 @@ impl Odometry {
             carried: false,
             carried_frames: 0,
             part: 0,
+            noise: 1.0,
         }
     }
 
@@ -467,7 +475,7 @@ impl Odometry {
         let rotation = pose.rotation.to_rotation_matrix();
         let covariance = rotation.matrix() * landmark.covariance * rotation.matrix().transpose();
         let own: f64 = by_point.iter().map(|row| Vector3::from(*row)).map(|row| row.dot(&(covariance * row))).sum();
-        let sigma = sigma_px / camera.fx_px;
+        let sigma = self.noise * sigma_px / camera.fx_px;
         Some(Sight {
             landmark: id,
             world: landmark.world,
@@ -522,10 +530,15 @@ impl Odometry {
             solved = pose::solve(start, &sights, hold(HOLD_FIRM_RAD))?;
         }
         let pose = solved.camera_from_world;
+        // In a noisy image patches are found worse than they seem to be: the sights themselves tell by how much.
+        let misfits: Vec<f64> = sights.iter().map(|sight| pose::misfit(&pose, sight)).collect();
+        let noise = (median(&mut misfits.clone()) / MEDIAN_MISFIT).clamp(1.0 / NOISE_RANGE, NOISE_RANGE);
+        let outlier = OUTLIER * noise.max(1.0);
+        self.noise = (self.noise * noise.powf(NOISE_GAIN)).clamp(1.0, NOISE_RANGE);
         let (mut good, mut places) = (Vec::new(), HashMap::new());
-        for (sight, at) in sights.into_iter().zip(seen) {
+        for ((sight, at), misfit) in sights.into_iter().zip(seen).zip(misfits) {
             let Some(landmark) = self.landmarks.get_mut(&sight.landmark) else { continue };
-            if pose::misfit(&pose, &sight) > OUTLIER {
+            if misfit > outlier {
                 landmark.misses += 1;
                 landmark.dead = landmark.misses > MISSES;
                 continue;
@@ -606,7 +619,7 @@ impl Odometry {
 
     /// A sight's own error, without that of the place.
     fn plain_sigma(&self, sight: &Sight) -> f64 {
-        sight.sigma.clamp(SIGMA_PX.0 / self.rig.camera.fx_px, 0.15 / self.rig.camera.fx_px)
+        sight.sigma.clamp(SIGMA_PX.0 / self.rig.camera.fx_px, self.noise * 0.15 / self.rig.camera.fx_px)
     }
 
     fn adjust(&mut self, rounds: usize) {
