@@ -21,6 +21,8 @@ use crate::triangulation::Profile;
 
 /// Fewest landmarks that a pose is solved from.
 const FEWEST_SIGHTS: usize = 10;
+/// With less than this in a key frame, new landmarks are looked for soon.
+const FEW_SIGHTS: usize = 50;
 /// Fewest points of a profile that a run can begin with.
 const FEWEST_POINTS: usize = 30;
 /// How far from the predicted place a patch is looked for, px of the full image.
@@ -51,7 +53,7 @@ const NOISE_GAIN: f64 = 0.3;
 /// Sights further off than this many standard deviations are wrong.
 const OUTLIER: f64 = 5.0;
 /// Frames in a row without a landmark that should be there, after which it is given up.
-const MISSES: u32 = 6;
+const MISSES: u32 = 4;
 /// Landmarks out of view that are kept for a robot that comes back.
 const DORMANT: usize = 300;
 /// Standard deviation of the laser's depth at one line position, px of the stripe.
@@ -379,7 +381,7 @@ impl Odometry {
             self.choose_landmarks(view, profile, &adjusted);
             self.settle_finished();
             last.since_keyframe_px = 0.0;
-            last.tracked_at_keyframe = tracked.max(FEWEST_SIGHTS);
+            last.tracked_at_keyframe = tracked.max(FEW_SIGHTS);
             self.prune(view.frame);
         }
         while self.waiting.len() > self.options.waiting_max as usize {
