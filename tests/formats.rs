@@ -80,7 +80,10 @@ fn texture_and_preview_are_pictures() {
     let folder = folder();
     let mut map = map(folder.path());
     texture::write(&mut map, folder.path()).expect("write");
-    preview::picture(&mut map, &PreviewText::default()).expect("picture").save(&folder.path().join("preview.png")).expect("write");
+    preview::picture(&mut map, &PreviewText::default())
+        .expect("picture")
+        .save(&folder.path().join("preview.png"))
+        .expect("write");
     read_with("pictures.py", folder.path());
 }
 

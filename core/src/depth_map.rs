@@ -282,7 +282,8 @@ impl SurfaceMap {
 
     /// The tiles that changed since this was last asked.
     pub fn take_changed(&mut self) -> Vec<TileIndex> {
-        let in_memory = self.tiles.iter_mut().filter_map(|tile| std::mem::take(&mut tile.changed).then_some(tile.index));
+        let in_memory =
+            self.tiles.iter_mut().filter_map(|tile| std::mem::take(&mut tile.changed).then_some(tile.index));
         self.changed.extend(in_memory);
         self.changed.drain().collect()
     }

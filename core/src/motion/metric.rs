@@ -16,5 +16,6 @@ mod landmark;
 mod odometry;
 mod patch;
 mod pose;
+mod view;
 
 pub use odometry::{Motion, Odometry, SettledPose};

@@ -297,7 +297,7 @@ fn strongest_start(
     let at = |group: Option<usize>| group.and_then(|g| chosen.get(g)).copied().flatten().map(|c| c.across_px);
     let own = at(Some(group));
     // Neighbours only help where the group itself knows something: a gap's edge is not widened by them.
-    let beside = own.is_some().then(|| [at(group.checked_sub(1)), at(Some(group + 1))]).unwrap_or_default();
+    let beside = if own.is_some() { [at(group.checked_sub(1)), at(Some(group + 1))] } else { [None; 2] };
     let starts = [own, beside[0], beside[1], line.get(group).copied().flatten()];
     let mut best: Option<(f32, f32)> = None;
     for (i, start) in starts.iter().enumerate() {

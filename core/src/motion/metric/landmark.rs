@@ -19,6 +19,19 @@ const EDGE: usize = (REACH + 4).div_ceil(SHRINK) + 1;
 /// A sight or a depth in the key frame of that number.
 pub(super) type InKeyframe<T> = (u32, T);
 
+/// Where and how a landmark is looked for.
+#[derive(Clone, Copy)]
+pub(super) struct Search {
+    /// Where the pose sees it, raw px.
+    pub at: (f64, f64),
+    /// Where to begin, raw px.
+    pub near: (f64, f64),
+    /// How far from there it may be, px.
+    pub largest_px: f32,
+    /// How like its patch it must be, 0 to 1.
+    pub least_likeness: f32,
+}
+
 /// A patch of the wall.
 pub(super) struct Landmark {
     pub world: Point3<f64>,
@@ -95,18 +108,15 @@ impl Landmark {
         project(camera, &(camera_from_world * self.world))
     }
 
-    /// Looks for the patch, turned and stretched as the pose says (which sees it `at`), around a place `near` there. `None` where
-    /// nothing is at least so like it.
+    /// Looks for the patch, turned and stretched as the pose says. `None` where nothing is as like it as asked for.
     pub(super) fn find(
         &mut self,
         image: Gray<'_>,
         camera: &Camera,
         camera_from_world: &Isometry3<f64>,
-        at: (f64, f64),
-        near: (f64, f64),
-        largest_px: f32,
-        least_likeness: f32,
+        search: &Search,
     ) -> Option<Found> {
+        let Search { at, near, largest_px, least_likeness } = *search;
         let stretch = self.stretch_seen(camera, camera_from_world, at)?;
         let change = (0..2).flat_map(|i| (0..2).map(move |j| (i, j)));
         if change.map(|(i, j)| (stretch[i][j] - self.stretch[i][j]).abs()).fold(0.0, f32::max) > STRETCH_STEP {

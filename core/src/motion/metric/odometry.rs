@@ -1,20 +1,22 @@
 //! Frame by frame: predict, find the landmarks, solve the pose; at key frames choose landmarks and adjust.
 
+mod choosing;
+mod settling;
+
 use std::collections::{BTreeMap, HashMap, VecDeque};
 
-use nalgebra::{Isometry3, Matrix3, Point3, Vector3};
+use nalgebra::{Isometry3, Point3, Vector3};
 
 use super::bundle::{self, Place, PlaceDepth, PlaceSight, View};
-use super::depth::{self, Known};
-use super::image::{Gray, Small};
-use super::landmark::{Landmark, best_place};
+use super::landmark::{Landmark, Search};
 use super::patch::Found;
 use super::pose::{self, Sight};
+use super::view::FrameView;
 use crate::geometry::{RawPixel, WorldFromCamera};
 use crate::motion::similarity::{FEWEST_CORNERS, median, scale_and_residual};
 use crate::motion::{Shift, TrackedCorner, start_pose};
 use crate::recipe::PoseOptions;
-use crate::rig::{LineDirection, Rig};
+use crate::rig::Rig;
 use crate::source::Yuv;
 use crate::stripe::Stripe;
 use crate::triangulation::Profile;
@@ -71,6 +73,9 @@ const HOLD_MM: f64 = 50.0;
 /// Where the landmarks tell a rotation worse than this, radians, it is held as predicted: three degrees of freedom.
 const ROTATION_SIGMA_RAD: f64 = 0.004;
 const HOLD_FIRM_RAD: f64 = 1e-4;
+
+/// Where landmarks are in an image, raw px.
+type Places = HashMap<u32, (f64, f64)>;
 
 /// What a frame's motion is at once; its pose may still be adjusted.
 #[derive(Clone, Debug)]
@@ -142,74 +147,6 @@ struct Waiting {
     degrees_of_freedom: u8,
 }
 
-/// What the frame shows, for all steps.
-struct View3<'a> {
-    gray: Gray<'a>,
-    small: std::cell::OnceCell<Small>,
-    line: LineBand,
-    frame: u32,
-}
-
-impl View3<'_> {
-    fn small(&self) -> Gray<'_> {
-        self.small.get_or_init(|| Small::of(self.gray)).gray()
-    }
-}
-
-/// Where the laser line is: nothing near it is the wall's own look.
-struct LineBand {
-    direction: LineDirection,
-    /// At each line position the line's place or its neighbours', px; empty where there is no line at all.
-    across_px: Vec<f32>,
-    half_px: f32,
-}
-
-impl LineBand {
-    fn of(stripe: &Stripe, line_width_px: f32) -> LineBand {
-        let mut across_px = stripe.across_px.clone();
-        let mut last = across_px.iter().copied().find(|x| x.is_finite());
-        match last {
-            None => across_px.clear(),
-            Some(_) => {
-                for x in &mut across_px {
-                    if x.is_finite() {
-                        last = Some(*x);
-                    } else if let Some(last) = last {
-                        *x = last;
-                    }
-                }
-            }
-        }
-        LineBand { direction: stripe.line, across_px, half_px: 2.0 * line_width_px + 14.0 }
-    }
-
-    /// (along, across) of an image place.
-    fn axes(&self, place: (f64, f64)) -> (f64, f64) {
-        match self.direction {
-            LineDirection::Vertical => (place.1, place.0),
-            LineDirection::Horizontal => (place.0, place.1),
-        }
-    }
-
-    /// Signed distance across the line, px.
-    fn distance_px(&self, place: (f64, f64)) -> Option<f64> {
-        let (along, across) = self.axes(place);
-        let last = self.across_px.len().checked_sub(1)?;
-        let at = along.round().clamp(0.0, last as f64) as usize;
-        Some(across - f64::from(self.across_px[at]))
-    }
-
-    fn covers(&self, place: (f64, f64)) -> bool {
-        let (along, across) = self.axes(place);
-        let Some(last) = self.across_px.len().checked_sub(1) else { return false };
-        // Over the patch's own height the line may lean.
-        [-9.0, 0.0, 9.0].iter().any(|off| {
-            let at = (along + off).round().clamp(0.0, last as f64) as usize;
-            (across - f64::from(self.across_px[at])).abs() < f64::from(self.half_px)
-        })
-    }
-}
-
 impl Odometry {
     /// An odometry at the start of a run.
     pub fn new(rig: &Rig, options: &PoseOptions) -> Odometry {
@@ -244,12 +181,7 @@ impl Odometry {
         line_width_px: f32,
         given: Option<Isometry3<f64>>,
     ) -> Motion {
-        let view = View3 {
-            gray: Gray::of(image),
-            small: std::cell::OnceCell::new(),
-            line: LineBand::of(stripe, line_width_px),
-            frame,
-        };
+        let view = FrameView::new(frame, image, stripe, line_width_px);
         let rows = dense(profile, stripe.across_px.len());
         let Some(last) = self.last.take() else {
             return self.begin(&view, profile, rows, start_pose(self.rig.laser.line));
@@ -284,7 +216,7 @@ impl Odometry {
     /// The first frame of a part: nothing to follow yet.
     fn begin(
         &mut self,
-        view: &View3<'_>,
+        view: &FrameView<'_>,
         profile: &Profile,
         rows: Vec<Option<Point3<f64>>>,
         pose: Isometry3<f64>,
@@ -314,7 +246,7 @@ impl Odometry {
     /// Where the given motion carries the pose on, the way is not broken.
     fn miss(
         &mut self,
-        view: &View3<'_>,
+        view: &FrameView<'_>,
         profile: &Profile,
         rows: Vec<Option<Point3<f64>>>,
         mut last: Last,
@@ -348,7 +280,7 @@ impl Odometry {
 
     fn advance(
         &mut self,
-        view: &View3<'_>,
+        view: &FrameView<'_>,
         profile: &Profile,
         rows: Vec<Option<Point3<f64>>>,
         last: Last,
@@ -405,7 +337,7 @@ struct Followed {
 
 impl Odometry {
     /// Finds the landmarks near where the last motion puts them; where that fails, in the shrunk image first.
-    fn follow(&mut self, view: &View3<'_>, last: &Last, given: Option<Isometry3<f64>>) -> Option<Followed> {
+    fn follow(&mut self, view: &FrameView<'_>, last: &Last, given: Option<Isometry3<f64>>) -> Option<Followed> {
         let steady = last.velocity * last.pose;
         let predicted = given.map_or(steady, |moved| moved * last.pose);
         if self.probe(view, &predicted)
@@ -420,7 +352,7 @@ impl Odometry {
     }
 
     /// Landmarks in view and off the line, with where they should be.
-    fn visible(&self, view: &View3<'_>, pose: &Isometry3<f64>) -> Vec<(u32, (f64, f64))> {
+    fn visible(&self, view: &FrameView<'_>, pose: &Isometry3<f64>) -> Vec<(u32, (f64, f64))> {
         let inside = |at: &(f64, f64)| view.gray.holds(at.0 as f32, at.1 as f32, 10.0) && !view.line.covers(*at);
         let alive = self.landmarks.iter().filter(|(_, landmark)| !landmark.dead);
         alive
@@ -429,23 +361,19 @@ impl Odometry {
             .collect()
     }
 
-    fn probe(&mut self, view: &View3<'_>, pose: &Isometry3<f64>) -> bool {
+    fn probe(&mut self, view: &FrameView<'_>, pose: &Isometry3<f64>) -> bool {
         let visible = self.visible(view, pose);
         let step = visible.len().div_ceil(PROBES).max(1);
         let probes: Vec<_> = visible.into_iter().step_by(step).collect();
         let found = probes.iter().filter(|(id, at)| {
             let Some(landmark) = self.landmarks.get_mut(id) else { return false };
-            landmark.find(view.gray, &self.rig.camera, pose, *at, *at, NEAR_PX, LEAST_LIKENESS).is_some()
+            landmark.find(view.gray, &self.rig.camera, pose, &search(*at, *at)).is_some()
         });
         found.count() as f64 >= PROBES_FOUND * probes.len() as f64
     }
 
     /// A pose from the shrunk image, and where in the full one it shows each landmark, both good to about a pixel.
-    fn coarse_pose(
-        &self,
-        view: &View3<'_>,
-        start: &Isometry3<f64>,
-    ) -> Option<(Isometry3<f64>, HashMap<u32, (f64, f64)>)> {
+    fn coarse_pose(&self, view: &FrameView<'_>, start: &Isometry3<f64>) -> Option<(Isometry3<f64>, Places)> {
         let small = view.small();
         let visible = self.visible(view, start);
         let found: Vec<(u32, (f64, f64), [f64; 2])> = visible
@@ -459,8 +387,7 @@ impl Odometry {
         if found.len() < FEWEST_SIGHTS {
             return None;
         }
-        let places: HashMap<u32, (f64, f64)> =
-            found.iter().map(|(id, at, off)| (*id, (at.0 + off[0], at.1 + off[1]))).collect();
+        let places: Places = found.iter().map(|(id, at, off)| (*id, (at.0 + off[0], at.1 + off[1]))).collect();
         let sights: Vec<Sight> =
             found.iter().filter_map(|(id, ..)| self.sight(*id, places[id], COARSE_SIGMA_PX, start)).collect();
         let pose = pose::solve(start, &sights, hold(HOLD_RAD))?.camera_from_world;
@@ -487,12 +414,7 @@ impl Odometry {
     }
 
     /// Finds the landmarks near where the pose puts them, or where `places` says, and solves the pose.
-    fn solve_frame(
-        &mut self,
-        view: &View3<'_>,
-        start: &Isometry3<f64>,
-        places: &HashMap<u32, (f64, f64)>,
-    ) -> Option<Followed> {
+    fn solve_frame(&mut self, view: &FrameView<'_>, start: &Isometry3<f64>, places: &Places) -> Option<Followed> {
         let visible = self.visible(view, start);
         let (mut sights, mut seen) = (Vec::new(), Vec::new());
         let mut found: Vec<(u32, Option<Found>)> = Vec::with_capacity(visible.len());
@@ -500,7 +422,7 @@ impl Odometry {
             let camera = &self.rig.camera;
             let Some(landmark) = self.landmarks.get_mut(id) else { continue };
             let near = places.get(id).copied().unwrap_or(*at);
-            found.push((*id, landmark.find(view.gray, camera, start, *at, near, NEAR_PX, LEAST_LIKENESS)));
+            found.push((*id, landmark.find(view.gray, camera, start, &search(*at, near))));
         }
         if (found.iter().filter(|(_, f)| f.is_some()).count() as f64) < FOUND_SHARE * found.len() as f64 {
             for ((id, place), (_, at)) in found.iter_mut().zip(&visible).filter(|((_, place), _)| place.is_none()) {
@@ -555,7 +477,7 @@ impl Odometry {
     }
 
     /// Landmarks that the line passed over since the last frame get their depth from it.
-    fn cross_line(&mut self, view: &View3<'_>, pose: &Isometry3<f64>, rows: &[Option<Point3<f64>>], last: &Last) {
+    fn cross_line(&mut self, view: &FrameView<'_>, pose: &Isometry3<f64>, rows: &[Option<Point3<f64>>], last: &Last) {
         let Some(keyframe) = self.keyframes.back() else { return };
         let from_keyframe = pose * keyframe.camera_from_world.inverse();
         let before_to_now = pose * last.pose.inverse();
@@ -657,156 +579,16 @@ impl Odometry {
         }
     }
 
-    /// New landmarks where the image has none.
-    fn choose_landmarks(&mut self, view: &View3<'_>, profile: &Profile, pose: &Isometry3<f64>) {
-        let camera = self.rig.camera.clone();
-        let (width, height) = (view.gray.width, view.gray.height);
-        let side = ((width * height) as f64 / f64::from(self.options.landmarks)).sqrt().max(24.0);
-        let (columns, rows) = ((width as f64 / side).round() as usize, (height as f64 / side).round() as usize);
-        let (columns, rows) = (columns.max(1), rows.max(1));
-        let mut taken = vec![false; columns * rows];
-        let mut known = self.known_depths(profile, pose);
-        for landmark in self.landmarks.values().filter(|l| !l.dead) {
-            let Some((x, y)) = landmark.seen_at(&camera, pose) else { continue };
-            if x >= 0.0 && y >= 0.0 && x < width as f64 && y < height as f64 {
-                let cell = (y as usize * rows / height) * columns + x as usize * columns / width;
-                taken[cell.min(columns * rows - 1)] = true;
-            }
-        }
-        if known.len() > 400 {
-            let step = known.len() / 400 + 1;
-            known = known.into_iter().step_by(step).collect();
-        }
-        let along = match self.rig.laser.line {
-            LineDirection::Vertical => 1,
-            LineDirection::Horizontal => 0,
-        };
-        let number = self.keyframes.back().map_or(0, |k| k.number);
-        let world_from_camera = pose.inverse();
-        for cell in (0..columns * rows).filter(|cell| !taken[*cell]) {
-            let (column, row) = (cell % columns, cell / columns);
-            let across = column * width / columns..(column + 1) * width / columns;
-            let down = row * height / rows..(row + 1) * height / rows;
-            let clear = |x: usize, y: usize| !view.line.covers((x as f64, y as f64));
-            let least = self.options.texture_min as f32;
-            let Some((x, y)) = best_place(view.small(), across, down, least, clear) else { continue };
-            let ray = camera.undistort(RawPixel { u_px: x as f64, v_px: y as f64 });
-            let ray = [ray.x, ray.y];
-            let Some(guess) = depth::guess(&known, ray, along) else { continue };
-            let inverse_at = |r: [f64; 2]| {
-                let slope = guess.slopes[0] * (r[0] - ray[0]) + guess.slopes[1] * (r[1] - ray[1]);
-                (guess.inverse_mm + slope).max(0.3 * guess.inverse_mm)
-            };
-            let chosen = Landmark::choose(view.gray, view.small(), (x, y), &camera, &world_from_camera, inverse_at);
-            let Some(mut landmark) = chosen else { continue };
-            let z_mm = 1.0 / guess.inverse_mm;
-            let sigma_mm = guess.sigma_share * z_mm;
-            let sight_sigma = SIGMA_PX.0 / camera.fx_px;
-            let direction = world_from_camera.rotation * Vector3::new(ray[0], ray[1], 1.0);
-            landmark.covariance = direction * direction.transpose() * (sigma_mm * sigma_mm)
-                + Matrix3::identity() * (sight_sigma * z_mm).powi(2);
-            landmark.sights.push((number, PlaceSight { view: 0, ray, sigma: sight_sigma }));
-            let depth = PlaceDepth { guess: true, view: 0, direction: Vector3::z(), distance_mm: z_mm, sigma_mm };
-            landmark.depths.push((number, depth));
-            landmark.last_frame = view.frame;
-            self.landmarks.insert(self.next_landmark, landmark);
-            self.next_landmark += 1;
-        }
-    }
-
-    /// Depths in this view: the profile's, and those of landmarks that are sure.
-    fn known_depths(&self, profile: &Profile, pose: &Isometry3<f64>) -> Vec<Known> {
-        let of = |p: &Point3<f64>| Known { ray: [p.x / p.z, p.y / p.z], inverse_mm: 1.0 / p.z };
-        let step = (profile.points.len() / 60).max(1);
-        let mut known: Vec<Known> = profile.points.iter().step_by(step).map(|p| of(&p.point_in_camera)).collect();
-        for landmark in self.landmarks.values().filter(|l| !l.dead) {
-            let p = pose * landmark.world;
-            if p.z > 1.0 && landmark.covariance.trace().sqrt() < SURE_SHARE * p.z {
-                known.push(of(&p));
-            }
-        }
-        known
-    }
-
     fn alive_places(&self, pose: &Isometry3<f64>) -> HashMap<u32, (f32, f32)> {
         let place = |landmark: &Landmark| landmark.seen_at(&self.rig.camera, pose);
         let alive = self.landmarks.iter().filter(|(_, l)| !l.dead);
         alive.filter_map(|(id, l)| place(l).map(|(x, y)| (*id, (x as f32, y as f32)))).collect()
     }
+}
 
-    fn wait(&mut self, frame: u32, pose: Option<Isometry3<f64>>, sights: Vec<Sight>, degrees_of_freedom: u8) {
-        let keyframe = self.next_keyframe;
-        self.waiting.push_back(Waiting { frame, pose, sights, keyframe, part: self.part, degrees_of_freedom });
-        if self.keyframes.is_empty() {
-            self.settle_all_without_pose();
-        }
-    }
-
-    /// Frames before the first key frame have no pose and never get one.
-    fn settle_all_without_pose(&mut self) {
-        while self.waiting.front().is_some_and(|w| w.pose.is_none()) {
-            if let Some(waiting) = self.waiting.pop_front() {
-                self.settle(waiting);
-            }
-        }
-    }
-
-    fn settle_all(&mut self) {
-        while let Some(waiting) = self.waiting.pop_front() {
-            self.settle(waiting);
-        }
-    }
-
-    /// Frames whose following key frame is fixed are done.
-    fn settle_finished(&mut self) {
-        let newest_fixed = self.keyframes.iter().rev().find(|k| k.fixed).map_or(0, |k| k.number);
-        while self.waiting.front().is_some_and(|w| w.keyframe <= newest_fixed) {
-            if let Some(waiting) = self.waiting.pop_front() {
-                self.settle(waiting);
-            }
-        }
-    }
-
-    /// The pose once more, now that the landmarks are where they are.
-    fn settle(&mut self, waiting: Waiting) {
-        let pose = waiting.pose.map(|pose| {
-            let sights: Vec<Sight> = waiting
-                .sights
-                .iter()
-                .filter_map(|s| {
-                    let landmark = self.landmarks.get(&s.landmark)?;
-                    Some(Sight { world: landmark.world, sigma: self.plain_sigma(s), ..*s })
-                })
-                .collect();
-            if sights.len() < FEWEST_SIGHTS {
-                return pose;
-            }
-            let held = if waiting.degrees_of_freedom == 6 { HOLD_RAD } else { HOLD_FIRM_RAD };
-            pose::solve(&pose, &sights, hold(held)).map_or(pose, |solved| solved.camera_from_world)
-        });
-        self.settled.push(SettledPose {
-            frame: waiting.frame,
-            world_from_camera: pose.map(|p| p.inverse()),
-            part: waiting.part,
-            degrees_of_freedom: waiting.degrees_of_freedom,
-        });
-    }
-
-    /// Drops landmarks that nothing needs any more.
-    fn prune(&mut self, frame: u32) {
-        let oldest_waiting = self.waiting.front().map_or(frame, |w| w.frame);
-        self.landmarks.retain(|_, l| l.last_frame >= oldest_waiting || (!l.dead && l.measured));
-        let mut out_of_sight: Vec<(u32, u32)> = self
-            .landmarks
-            .iter()
-            .filter(|(_, l)| l.last_frame < oldest_waiting)
-            .map(|(id, l)| (l.last_frame, *id))
-            .collect();
-        out_of_sight.sort_unstable();
-        for (_, id) in out_of_sight.iter().take(out_of_sight.len().saturating_sub(DORMANT)) {
-            self.landmarks.remove(id);
-        }
-    }
+/// A search in the full image around a place.
+fn search(at: (f64, f64), near: (f64, f64)) -> Search {
+    Search { at, near, largest_px: NEAR_PX, least_likeness: LEAST_LIKENESS }
 }
 
 /// Information that keeps a pose near its start.

@@ -182,13 +182,7 @@ impl Patch {
         /// The same with the wider registers of processors since 2013: half of the motion's time is spent here.
         #[cfg(target_arch = "x86_64")]
         #[target_feature(enable = "avx2")]
-        fn wide(
-            patch: &Patch,
-            image: Gray<'_>,
-            x: f32,
-            y: f32,
-            seen: &mut [f32; PIXELS],
-        ) -> Option<(f32, (f32, f32))> {
+        fn wide(patch: &Patch, image: Gray<'_>, x: f32, y: f32, seen: &mut [f32; PIXELS]) -> Option<(f32, (f32, f32))> {
             patch.step_anywhere(image, x, y, seen)
         }
         #[cfg(target_arch = "x86_64")]

@@ -39,9 +39,12 @@ pub(super) fn moved(camera_from_world: &Isometry3<f64>, delta: &Vector6<f64>) ->
     Isometry3::from_parts(Translation3::from(shifted), UnitQuaternion::new_normalize(turned.into_inner()))
 }
 
+/// Where a point is seen, and the rows of its change with the camera's move and with the point.
+pub(super) type Projection = (Vector2<f64>, [[f64; 6]; 2], [[f64; 3]; 2]);
+
 /// Where a point of the camera's frame is seen, and how that changes with the camera's move (two rows of six) and with
 /// the point (two rows of three). `None` behind the camera.
-pub(super) fn projection(p: &Point3<f64>) -> Option<(Vector2<f64>, [[f64; 6]; 2], [[f64; 3]; 2])> {
+pub(super) fn projection(p: &Point3<f64>) -> Option<Projection> {
     if p.z < 1.0 {
         return None;
     }
