@@ -55,6 +55,16 @@ impl Stripe {
         })
     }
 
+    /// `across_px` with the gaps filled from the spot before (at the start: the first one); empty where nothing was found.
+    pub fn filled_px(&self) -> Vec<f32> {
+        let Some(mut last) = self.across_px.iter().copied().find(|x| x.is_finite()) else { return Vec::new() };
+        let fill = |x: &f32| {
+            last = if x.is_finite() { *x } else { last };
+            last
+        };
+        self.across_px.iter().map(fill).collect()
+    }
+
     /// The median of `across_px`; `None` where nothing was found.
     pub fn median_px(&self) -> Option<f64> {
         let mut found: Vec<f32> = self.across_px.iter().copied().filter(|x| x.is_finite()).collect();

@@ -29,18 +29,7 @@ pub(super) struct Recent {
 
 impl Recent {
     pub(super) fn new(image: Arc<Image>, camera_from_world: Isometry3<f64>, stripe: &Stripe) -> Recent {
-        let mut line_px = stripe.across_px.clone();
-        let mut last = line_px.iter().copied().find(|x| x.is_finite());
-        if last.is_none() {
-            line_px.clear();
-        }
-        for x in &mut line_px {
-            match (x.is_finite(), last) {
-                (true, _) => last = Some(*x),
-                (false, Some(last)) => *x = last,
-                (false, None) => {}
-            }
-        }
+        let line_px = stripe.filled_px();
         Recent { image, camera_from_world, line_px, line: stripe.line }
     }
 

@@ -37,20 +37,7 @@ pub(super) struct LineBand {
 
 impl LineBand {
     fn of(stripe: &Stripe, line_width_px: f32) -> LineBand {
-        let mut across_px = stripe.across_px.clone();
-        let mut last = across_px.iter().copied().find(|x| x.is_finite());
-        match last {
-            None => across_px.clear(),
-            Some(_) => {
-                for x in &mut across_px {
-                    if x.is_finite() {
-                        last = Some(*x);
-                    } else if let Some(last) = last {
-                        *x = last;
-                    }
-                }
-            }
-        }
+        let across_px = stripe.filled_px();
         LineBand { direction: stripe.line, across_px, half_px: 2.0 * line_width_px + 14.0 }
     }
 
