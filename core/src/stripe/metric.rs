@@ -418,3 +418,6 @@ impl<'a> Lines<'a> {
         Some(((first + core) as f32 + best as f32, score))
     }
 }
+
+#[cfg(test)]
+mod tests;
