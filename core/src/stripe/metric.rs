@@ -216,7 +216,7 @@ impl StripeMeasurer {
             let offset = seen.starts[position] as f32 - stripe.across_px[position];
             luma.read_between(*along, across + offset, table, out);
         }
-        spot::soften(pattern, samples);
+        let trust = spot::soften(pattern, samples);
         self.divided.resize(samples, 0.0);
         for position in 0..positions {
             let pattern = &pattern[position * samples..][..samples];
@@ -224,7 +224,7 @@ impl StripeMeasurer {
                 continue;
             }
             let start = stripe.across_px[position] - seen.starts[position] as f32;
-            if !seen.shape.divide(seen.profile(position), pattern, &mut self.divided) {
+            if !seen.shape.divide(seen.profile(position), pattern, trust, &mut self.divided) {
                 continue;
             }
             if let Some(spot) = seen.shape.find(&self.divided, Background::None, start, SETTLED_PX)

@@ -18,6 +18,10 @@ const PATTERN_SHARE: f32 = 0.08;
 const NOISE_LIGHT: f32 = 0.004;
 /// Error of the centre in widths of the line where the two sides differ by as much light as the line has.
 const GLARE: f32 = 0.12;
+/// Rows between those that tell how much of the pattern is noise.
+const PROBE_STEP: usize = 8;
+/// Noise that the softening leaves, as a share of what it takes away: 0.10 of white noise's power against 0.73.
+const NOISE_LEFT: f32 = 0.141;
 /// The pattern is not trusted below this light: division would lift noise.
 const PATTERN_MIN_LIGHT: f32 = 0.004;
 
@@ -142,9 +146,9 @@ impl SpotShape {
         (top > background).then(|| Some(crossing(middle, 1)? - crossing(middle, -1)?)).flatten()
     }
 
-    /// The profile's light above its sides, divided by the wall's pattern (1 on average). False where the pattern is
-    /// too dark to tell.
-    pub(super) fn divide(&self, profile: &[f32], pattern: &[f32], out: &mut [f32]) -> bool {
+    /// The profile's light above its sides, divided by the wall's pattern (1 on average), of which `trust` (0 to 1) is
+    /// believed. False where the pattern is too dark to tell.
+    pub(super) fn divide(&self, profile: &[f32], pattern: &[f32], trust: f32, out: &mut [f32]) -> bool {
         let mean = pattern.iter().sum::<f32>() / pattern.len() as f32;
         if mean < PATTERN_MIN_LIGHT {
             return false;
@@ -153,7 +157,8 @@ impl SpotShape {
         let slope = (right - left) / (profile.len() - SIDE) as f32;
         let offset = (SIDE as f32 - 1.0) / 2.0;
         for (i, ((out, value), pattern)) in out.iter_mut().zip(profile).zip(pattern).enumerate() {
-            *out = (value - left - slope * (i as f32 - offset)) * mean / pattern.max(0.2 * mean);
+            *out = (value - left - slope * (i as f32 - offset)) * mean
+                / (mean + trust * (pattern - mean)).max(0.2 * mean);
         }
         true
     }
@@ -205,7 +210,17 @@ fn side(samples: &[f32]) -> f32 {
 
 /// Softens the wall's pattern, `samples` a line position, over its neighbours in both directions ([1 2 1] twice): what
 /// an encoder leaves of the finest pattern is noise. Rows of NaN stay so and count for nothing.
-pub(super) fn soften(pattern: &mut [f32], samples: usize) {
+///
+/// Returns the share of what is left that is the wall's and not noise, 0 to 1: in the dark a pattern is mostly noise, and
+/// dividing by it would do harm (Wiener's weight; the noise is judged by what the softening took away).
+pub(super) fn soften(pattern: &mut [f32], samples: usize) -> f32 {
+    let probes: Vec<(usize, Vec<f32>)> = pattern
+        .chunks_exact(samples)
+        .enumerate()
+        .step_by(PROBE_STEP)
+        .filter(|(_, row)| row[0].is_finite())
+        .map(|(row, values)| (row, values.to_vec()))
+        .collect();
     for row in pattern.chunks_exact_mut(samples).filter(|row| row[0].is_finite()) {
         for _ in 0..2 {
             let mut before = row[0];
@@ -233,4 +248,12 @@ pub(super) fn soften(pattern: &mut [f32], samples: usize) {
         }
         std::mem::swap(&mut before, &mut kept);
     }
+    let (mut taken, mut left) = (0.0, 0.0);
+    for (row, raw) in probes {
+        let soft = &pattern[row * samples..][..samples];
+        let mean = soft.iter().sum::<f32>() / samples as f32;
+        taken += raw.iter().zip(soft).map(|(raw, soft)| (raw - soft) * (raw - soft)).sum::<f32>();
+        left += soft.iter().map(|soft| (soft - mean) * (soft - mean)).sum::<f32>();
+    }
+    if left > 0.0 { (1.0 - NOISE_LEFT * taken / left).clamp(0.0, 1.0) } else { 0.0 }
 }
