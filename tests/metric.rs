@@ -255,3 +255,12 @@ fn a_wall_without_texture_says_that_it_cannot_be_followed() {
     assert!(run.manifest.warnings.iter().any(|w| w.contains("motion was lost")), "{:?}", run.manifest.warnings);
     assert!(run.manifest.gaps.iter().any(|g| g.reason == "not_tracked"));
 }
+
+#[test]
+fn few_frames_a_second_with_gait_are_followed() {
+    // Some 37 px from frame to frame, and not evenly.
+    let run = measure(scene("pipe"), 2.0, 12.0, 29, |_| true);
+    println!("12 frames/s: travel {:+.3} %", 100.0 * run.travel_error());
+    assert_eq!(run.manifest.quality.frames_tracked, u64::from(run.simulation.frames_total()) - 1);
+    assert!(run.travel_error().abs() < 0.01, "{}", run.travel_error());
+}

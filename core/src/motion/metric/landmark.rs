@@ -155,6 +155,17 @@ impl Landmark {
         Some([[a, b], [c, d]])
     }
 
+    /// How far from a place of the full image it seems to be by the shrunk one, full px, within `reach` px of that; and how
+    /// like it is there.
+    pub(super) fn search_small(&self, small: Gray<'_>, at: (f64, f64), reach: f32) -> Option<([f64; 2], f32)> {
+        let (patch, offset) = self.small.as_ref()?;
+        let start = (shrunk(at.0 as f32) + offset.0, shrunk(at.1 as f32) + offset.1);
+        let found = patch.search(small, start, reach)?;
+        let shrink = SHRINK as f32;
+        let off = [f64::from((found.x - start.0) * shrink), f64::from((found.y - start.1) * shrink)];
+        Some((off, found.likeness))
+    }
+
     /// Looks for it in the shrunk image around a place of the full one; the answer is in full px.
     pub(super) fn find_small(&self, small: Gray<'_>, at: (f64, f64), largest: f32) -> Option<Found> {
         let (patch, offset) = self.small.as_ref()?;

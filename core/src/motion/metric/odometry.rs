@@ -31,6 +31,11 @@ const FEWEST_POINTS: usize = 30;
 const NEAR_PX: f32 = 5.0;
 /// The same in the shrunk image, px of that.
 const NEAR_SMALL_PX: f32 = 14.0;
+/// Landmarks that a large shift of the whole image is looked for with, how far, as a share of the image's width, and
+/// how well most of them must agree, px of the full image.
+const SHIFT_PROBES: usize = 16;
+const SHIFT_SHARE: f32 = 0.06;
+const SHIFT_AGREES_PX: f64 = 16.0;
 /// Landmarks that are tried first: when most are where they should be, the prediction is good.
 const PROBES: usize = 14;
 /// Share of the probes that must be found.
@@ -376,10 +381,12 @@ impl Odometry {
     fn coarse_pose(&self, view: &FrameView<'_>, start: &Isometry3<f64>) -> Option<(Isometry3<f64>, Places)> {
         let small = view.small();
         let visible = self.visible(view, start);
+        let shift = self.large_shift(view, &visible);
         let found: Vec<(u32, (f64, f64), [f64; 2])> = visible
             .into_iter()
             .filter_map(|(id, at)| {
-                let found = self.landmarks.get(&id)?.find_small(small, at, NEAR_SMALL_PX)?;
+                let near = (at.0 + shift[0], at.1 + shift[1]);
+                let found = self.landmarks.get(&id)?.find_small(small, near, NEAR_SMALL_PX)?;
                 let off = [f64::from(found.x) - at.0, f64::from(found.y) - at.1];
                 (found.likeness >= LEAST_LIKENESS_SMALL).then_some((id, at, off))
             })
@@ -392,6 +399,29 @@ impl Odometry {
             found.iter().filter_map(|(id, ..)| self.sight(*id, places[id], COARSE_SIGMA_PX, start)).collect();
         let pose = pose::solve(start, &sights, hold(HOLD_RAD))?.camera_from_world;
         Some((pose, places))
+    }
+
+    /// The shift of most of the image from where the landmarks should be, px, from a wide search in the shrunk image; none
+    /// where they do not agree.
+    fn large_shift(&self, view: &FrameView<'_>, visible: &[(u32, (f64, f64))]) -> [f64; 2] {
+        let step = visible.len().div_ceil(SHIFT_PROBES).max(1);
+        let reach = SHIFT_SHARE * view.small().width as f32;
+        let shifts: Vec<[f64; 2]> = visible
+            .iter()
+            .step_by(step)
+            .filter_map(|(id, at)| self.landmarks.get(id)?.search_small(view.small(), *at, reach))
+            .filter(|(_, likeness)| *likeness >= LEAST_LIKENESS_SMALL)
+            .map(|(off, _)| off)
+            .collect();
+        if shifts.is_empty() {
+            return [0.0; 2];
+        }
+        let middle = |axis: usize| median(&mut shifts.iter().map(|off| off[axis]).collect::<Vec<_>>());
+        let shift = [middle(0), middle(1)];
+        let near = |off: &&[f64; 2]| (off[0] - shift[0]).hypot(off[1] - shift[1]) < SHIFT_AGREES_PX;
+        let agreed = 2 * shifts.iter().filter(near).count() >= shifts.len();
+        // A small one is found without help, and nearer places may shift more than farther ones.
+        if agreed && shift[0].hypot(shift[1]) > SHIFT_AGREES_PX { shift } else { [0.0; 2] }
     }
 
     fn sight(&self, id: u32, at: (f64, f64), sigma_px: f64, pose: &Isometry3<f64>) -> Option<Sight> {

@@ -14,6 +14,8 @@ const KEPT: usize = 2 * (REACH + 3);
 const PIXELS: usize = SIDE * SIDE;
 /// Rounds, at most.
 const ROUNDS: usize = 12;
+/// Steps of a wide search, px: a patch of this side is still like itself one step aside.
+const SEARCH_STEP_PX: f32 = 2.0;
 /// It is found when it moves less than this, px.
 const FOUND_PX: f32 = 0.03;
 /// A patch whose brightness changes by less than this (standard deviation, levels) cannot be followed.
@@ -175,6 +177,22 @@ impl Patch {
             last = step;
         }
         None
+    }
+
+    /// Where within `reach` px of a place, in steps of [`SEARCH_STEP_PX`], the image is most like the patch; and how like.
+    /// For shifts too large for [`Patch::find`].
+    pub(super) fn search(&self, image: Gray<'_>, start: (f32, f32), reach: f32) -> Option<Found> {
+        let mut seen = [0.0f32; PIXELS];
+        let steps = (reach / SEARCH_STEP_PX) as i32;
+        let mut best: Option<Found> = None;
+        for (row, column) in (-steps..=steps).flat_map(|row| (-steps..=steps).map(move |column| (row, column))) {
+            let (x, y) = (start.0 + column as f32 * SEARCH_STEP_PX, start.1 + row as f32 * SEARCH_STEP_PX);
+            let Some((likeness, _)) = self.step(image, x, y, &mut seen) else { continue };
+            if best.is_none_or(|best| likeness > best.likeness) {
+                best = Some(Found { x, y, likeness, sigma: SEARCH_STEP_PX });
+            }
+        }
+        best
     }
 
     /// One round: how alike the image is to the patch there, and how far the patch seems to be off.

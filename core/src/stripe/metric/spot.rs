@@ -157,8 +157,8 @@ impl SpotShape {
         let slope = (right - left) / (profile.len() - SIDE) as f32;
         let offset = (SIDE as f32 - 1.0) / 2.0;
         for (i, ((out, value), pattern)) in out.iter_mut().zip(profile).zip(pattern).enumerate() {
-            *out = (value - left - slope * (i as f32 - offset)) * mean
-                / (mean + trust * (pattern - mean)).max(0.2 * mean);
+            *out =
+                (value - left - slope * (i as f32 - offset)) * mean / (mean + trust * (pattern - mean)).max(0.2 * mean);
         }
         true
     }
