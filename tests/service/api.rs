@@ -91,7 +91,13 @@ fn lists_of_what_can_be_chosen() {
     let options = server.json("/api/options");
     let k = options.as_array().expect("a list").iter().find(|o| o["key"] == "stripe.k").expect("stripe.k").clone();
     assert_eq!((text(&k, "/range/kind"), k["range"]["min"].as_f64()), ("number".into(), Some(0.5)));
-    assert_eq!(server.json("/api/workers")[0]["slots"], 2);
+    // A worker says that it is there a moment after the server answers.
+    let slots = || server.json("/api/workers")[0]["slots"].as_u64();
+    let deadline = std::time::Instant::now() + std::time::Duration::from_secs(10);
+    while slots().is_none() && std::time::Instant::now() < deadline {
+        std::thread::sleep(std::time::Duration::from_millis(50));
+    }
+    assert_eq!(slots(), Some(2));
     assert_eq!(text(&server.json("/livez"), "/status"), "ok");
     assert_eq!(text(&server.json("/readyz"), "/status"), "ok");
 
