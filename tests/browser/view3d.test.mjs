@@ -63,7 +63,7 @@ test("a finished run: the surface is on the canvas, and its pixels are the surfa
 });
 
 test("a run that is being measured: the surface is on the canvas before the job has ended", async () => {
-  const run = await simulate({ seconds: 25 });
+  const run = await simulate({ seconds: 90 });
   const { page, close } = await openPage(browser, server);
   // The viewer is in the browser's cache and compiled when the job starts, as for anyone who watches a second run.
   await page.goto("/");
