@@ -58,7 +58,7 @@ struct Sample {
 }
 
 impl Sheet {
-    /// A sheet without profiles; gaps along the travel wider than `bridge_mm` stay holes.
+    /// A sheet without profiles; gaps wider than `bridge_mm`, along the travel or the line, stay holes.
     pub fn new(grid: Grid, bridge_mm: f64) -> Sheet {
         Sheet { grid, bridge_mm, first_row: 0, rows: Vec::new(), cells: Vec::new() }
     }
@@ -76,7 +76,8 @@ impl Sheet {
             let (a, b) = (&pair[0].point_in_world, &pair[1].point_in_world);
             let along_mm = (b.y - a.y).abs();
             let edge = (b.x - a.x).hypot(b.z - a.z) > EDGE_MM + STEEPEST * along_mm;
-            if position[1] - position[0] > MAX_ROW_GAP || edge {
+            // A ray that nearly grazes the laser plane ends far away: no surface reaches there from the spot before.
+            if position[1] - position[0] > MAX_ROW_GAP || edge || along_mm > self.bridge_mm {
                 continue;
             }
             let row_of = |y_mm: f64| (y_mm - self.grid.y_mm) / self.grid.mm_per_px;

@@ -8,7 +8,7 @@
 //! The centre comes from the luma alone. Encoders halve the chroma and do not agree on where its samples lie: using
 //! it moves the centre by a constant 0.08 px and more, which is a constant error in every depth. Luma is full-size and
 //! its place is certain. It is turned into light first, the surroundings are taken off, and the centroid under a
-//! Gaussian window finds the centre of a line whose core may be clipped: clipping is as symmetric as the line.
+//! bell-shaped window finds the centre of a line whose core may be clipped: clipping is as symmetric as the line.
 //!
 //! What then remains is mostly the wall's own pattern under the line. Dividing by the same strip of wall as an
 //! earlier frame saw it, without the laser, takes most of that away ([`Wall`]); smoothing along the line, never across
@@ -27,7 +27,7 @@ use crate::stripe::Stripe;
 use crate::stripe::choice::{self, Candidate};
 use spot::{Background, SpotShape};
 
-/// Line positions that share one search for colour: two rows of chroma.
+/// Line positions that share one search for colour.
 const GROUP: usize = evidence::GROUP;
 /// Width of the line at half its height that is assumed before the first frame, as a share of the image's width.
 const FIRST_WIDTH_SHARE: f32 = 1.0 / 160.0;
