@@ -1,6 +1,9 @@
 //! What the tests of the service share: the real binary, simulated runs, a server of their own.
 
+pub mod cluster;
 pub mod form;
+pub mod postgres;
+pub mod s3;
 pub mod server;
 
 use std::path::{Path, PathBuf};

@@ -1,12 +1,14 @@
 //! The command line: one file per command. A command returns its exit code; errors are said here, once.
 
 mod calibrate;
+mod engine;
 mod inspect;
 mod process;
 mod progress;
 mod send;
 mod serve;
 mod simulate;
+mod work;
 
 use std::process::ExitCode;
 
@@ -27,6 +29,7 @@ enum Command {
     Simulate(simulate::SimulateArgs),
     Calibrate(calibrate::Calibrate),
     Serve(serve::Serve),
+    Work(work::Work),
     Send(send::Send),
     Inspect(inspect::Inspect),
     /// Prints the OpenAPI document of the HTTP interface.
@@ -75,6 +78,7 @@ pub fn run() -> ExitCode {
         Command::Simulate(args) => simulate::run(&args).map(|()| Success::Done),
         Command::Calibrate(command) => command.run(),
         Command::Serve(command) => command.run(),
+        Command::Work(command) => command.run(),
         Command::Send(command) => command.run(),
         Command::Inspect(command) => command.run(),
         Command::Openapi => print_openapi(),

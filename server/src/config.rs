@@ -1,8 +1,11 @@
 //! Addresses, folders and limits: what the server may use and how long it waits. Flags set some; all have names here.
 
 use std::net::SocketAddr;
-use std::path::PathBuf;
+use std::path::{Path, PathBuf};
 use std::time::Duration;
+
+use crate::db::DatabasePlace;
+use crate::store::StorePlace;
 
 /// Bytes in a GB as the flags count them.
 pub const GB: u64 = 1_000_000_000;
@@ -12,8 +15,8 @@ pub const GB: u64 = 1_000_000_000;
 pub struct Config {
     /// Where to listen.
     pub listen: SocketAddr,
-    /// The folder with the records, the store and the scratch space.
-    pub data_dir: PathBuf,
+    /// Where everything is.
+    pub places: Places,
     /// Jobs that run at the same time.
     pub workers: usize,
     /// Limits of requests.
@@ -22,35 +25,45 @@ pub struct Config {
     pub jobs: JobLimits,
 }
 
-impl Config {
+/// Where a process keeps what.
+#[derive(Clone, Debug)]
+pub struct Places {
+    /// The process's own folder; where nothing else is said, the records and the files are in it as well.
+    pub folder: PathBuf,
     /// The records.
-    pub fn database(&self) -> PathBuf {
-        self.data_dir.join("stria.db")
-    }
+    pub database: DatabasePlace,
+    /// The files.
+    pub store: StorePlace,
+}
 
-    /// The files of the store.
-    pub fn store(&self) -> PathBuf {
-        self.data_dir.join("store")
+impl Places {
+    /// Everything in one folder.
+    pub fn in_folder(folder: &Path) -> Places {
+        Places {
+            folder: folder.to_path_buf(),
+            database: DatabasePlace::Sqlite(folder.join("stria.db")),
+            store: StorePlace::Folder(folder.join("store")),
+        }
     }
 
     /// Uploads that are still coming in.
     pub fn incoming(&self) -> PathBuf {
-        self.data_dir.join("incoming")
+        self.folder.join("incoming")
     }
 
     /// What attempts write before it is published.
     pub fn scratch(&self) -> PathBuf {
-        self.data_dir.join("scratch")
+        self.folder.join("scratch")
     }
 
-    /// Held by the one server that uses the folder.
+    /// Held by the one process that uses the folder.
     pub fn lock(&self) -> PathBuf {
-        self.data_dir.join("lock")
+        self.folder.join("lock")
     }
 
     /// The name of this folder's workers, the same after a restart.
     pub fn node(&self) -> PathBuf {
-        self.data_dir.join("node")
+        self.folder.join("node")
     }
 }
 
@@ -112,6 +125,11 @@ pub struct JobLimits {
     /// A worker without a sign of life for this long has lost its lease. Measured on the clock of whoever watches,
     /// which no one sets, so that a jump of the wall clock ends no lease.
     pub lease: Duration,
+    /// How long a worker tries to write what it has done while the records do not answer. Longer than a lease: whoever
+    /// has lost its lease hears so when they answer again.
+    pub record_patience: Duration,
+    /// How long of this a worker takes that was asked to stop.
+    pub stop_patience: Duration,
     /// How often a worker looks whether its job was cancelled.
     pub cancel_poll: Duration,
     /// Least time between two writes of progress.
@@ -150,6 +168,8 @@ impl Default for JobLimits {
             retry_max: Duration::from_secs(300),
             heartbeat: Duration::from_secs(5),
             lease: Duration::from_secs(60),
+            record_patience: Duration::from_secs(3600),
+            stop_patience: Duration::from_secs(10),
             cancel_poll: Duration::from_millis(300),
             progress_every: Duration::from_millis(500),
             time_limit: Duration::from_secs(12 * 3600),

@@ -86,7 +86,21 @@ impl Error {
             Error::Io { source, .. } => is_full(source),
             Error::Store(e) => chain_is_full(e),
             // SQLite's own words for SQLITE_FULL; the driver passes no kind through.
-            Error::Records(e) => e.to_string().contains("disk is full"),
+            // PostgreSQL's is 53100, which says "No space left on device".
+            Error::Records(e) => {
+                let words = e.to_string();
+                words.contains("disk is full") || words.contains("No space left")
+            }
+            _ => false,
+        }
+    }
+
+    /// True where the same may succeed in a moment, because a service that this one needs was away.
+    pub fn is_passing(&self) -> bool {
+        match self {
+            Error::Records(e) => crate::db::is_passing(e),
+            // Whatever S3 itself refuses has a kind of its own; what remains is the way to it, or its own trouble.
+            Error::Store(e) => matches!(e, object_store::Error::Generic { store: "S3", .. }),
             _ => false,
         }
     }

@@ -19,8 +19,8 @@ pub use lease::{Lease, Outcome, Progress, PublishedProduct, Signal};
 pub use lost::LeaseWatch;
 
 use crate::config::JobLimits;
-use crate::db::Db;
 use crate::db::tables::{job, run, segment, unpublished};
+use crate::db::{ANSWER_PATIENCE, Db, retried};
 use crate::error::{Error, Result};
 use crate::store;
 use crate::wire::time::now_ms;
@@ -160,6 +160,10 @@ impl Queue {
         if self.next_ready(self.db.read(), false).await?.is_none() {
             return Ok(None);
         }
+        retried(ANSWER_PATIENCE, || self.try_claim(node, worker)).await
+    }
+
+    async fn try_claim(&self, node: &str, worker: &str) -> Result<Option<Lease>> {
         let t = self.db.write().await?;
         let Some(next) = self.next_ready(&*t, true).await? else { return Ok(None) };
         let Some(run) = run::Entity::find_by_id(&next.run_id).one(&*t).await? else {
@@ -218,8 +222,12 @@ impl Queue {
 
     /// Asks a job to stop. A waiting one is cancelled at once, a running one when its worker hears of it.
     pub async fn cancel(&self, id: &str) -> Result<()> {
+        retried(ANSWER_PATIENCE, || self.try_cancel(id)).await
+    }
+
+    async fn try_cancel(&self, id: &str) -> Result<()> {
         let t = self.db.write().await?;
-        let found = find(&*t, id).await?;
+        let found = find_to_change(&*t, id).await?;
         match state_of(&found)? {
             JobState::Queued => {
                 let change = job::ActiveModel {
@@ -244,8 +252,12 @@ impl Queue {
 
     /// Puts a failed or cancelled job back to the queue, with all its attempts before it.
     pub async fn retry(&self, id: &str) -> Result<()> {
+        retried(ANSWER_PATIENCE, || self.try_retry(id)).await
+    }
+
+    async fn try_retry(&self, id: &str) -> Result<()> {
         let t = self.db.write().await?;
-        let found = find(&*t, id).await?;
+        let found = find_to_change(&*t, id).await?;
         match state_of(&found)? {
             JobState::Failed | JobState::Cancelled => {}
             other => {
@@ -286,8 +298,9 @@ pub async fn mark_unpublished(records: &impl ConnectionTrait, prefix: String, du
     Ok(())
 }
 
-async fn find(records: &impl ConnectionTrait, id: &str) -> Result<job::Model> {
-    let found = job::Entity::find_by_id(id).one(records).await?;
+/// A job, held until the end of the transaction.
+async fn find_to_change(records: &impl ConnectionTrait, id: &str) -> Result<job::Model> {
+    let found = job::Entity::find_by_id(id).lock_exclusive().one(records).await?;
     found.ok_or_else(|| Error::NotFound { what: "job", id: id.into() })
 }
 

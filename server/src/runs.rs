@@ -6,14 +6,14 @@ mod listing;
 mod rigs;
 
 use sea_orm::sea_query::OnConflict;
-use sea_orm::{ActiveValue::Set, ColumnTrait, ConnectionTrait, EntityTrait, QueryFilter};
+use sea_orm::{ActiveValue::Set, ColumnTrait, ConnectionTrait, EntityTrait, QueryFilter, QuerySelect};
 
 pub use jobs::content_type;
 pub use listing::{Page, RunFilter};
 pub use rigs::{RecipeText, RigText, built_in_recipes, options};
 
-use crate::db::Db;
 use crate::db::tables::{asset, idempotency_key, job, log_line, product, run, segment, unpublished};
+use crate::db::{ANSWER_PATIENCE, Db, retried};
 use crate::error::{Error, Result};
 use crate::incoming::Incoming;
 use crate::queue::{self, NewJob, Queue};
@@ -78,6 +78,16 @@ impl NewRun {
     }
 }
 
+/// An upload that lies in the store and is not recorded yet.
+#[derive(Clone, Copy)]
+struct Arrived<'a> {
+    run: &'a str,
+    extension: &'a str,
+    facts: &'a Facts,
+    key: Option<&'a str>,
+    fingerprint: &'a str,
+}
+
 /// A run that a request made, or had made before.
 pub struct Created<T> {
     /// What was made.
@@ -126,24 +136,43 @@ impl Runs {
         let run = Queue::new_id();
         let extension = store::plain_extension(&new.filename);
         let prefix = store::run_prefix(&run);
-        let t = self.db.write().await?;
-        queue::mark_unpublished(&*t, prefix.clone(), now_ms() + UNRECORDED_MS).await?;
-        t.commit().await?;
-        self.store.take_file(&incoming.file, &Key::source(&run, &extension)).await?;
+        retried(ANSWER_PATIENCE, || self.mark_unrecorded(&prefix)).await?;
+        self.store.take_file(&incoming.file, &Key::source(&run, &extension), &incoming.facts).await?;
         self.store.sync().await?;
 
+        let arrived =
+            Arrived { run: &run, extension: &extension, facts: &incoming.facts, key, fingerprint: &fingerprint };
+        let repeats = retried(ANSWER_PATIENCE, || self.record(new.clone(), &arrived)).await?;
+        self.queue.bell().ring();
+        let repeated = repeats.is_some();
+        Ok(Created { made: self.get(&repeats.unwrap_or(run)).await?, repeated })
+    }
+
+    async fn mark_unrecorded(&self, prefix: &str) -> Result<()> {
         let t = self.db.write().await?;
-        if let Some(job) = self.made_before(&*t, key, &fingerprint).await? {
-            // The same request came twice at the same time, and the other one was first.
-            queue::mark_unpublished(&*t, prefix, now_ms()).await?;
-            t.commit().await?;
-            return Ok(Created { made: self.get(&job.run_id).await?, repeated: true });
+        queue::mark_unpublished(&*t, prefix.into(), now_ms() + UNRECORDED_MS).await?;
+        t.commit().await
+    }
+
+    /// Run and job, in one transaction; or the run that the same request has made before.
+    async fn record(&self, new: NewRun, arrived: &Arrived<'_>) -> Result<Option<String>> {
+        let Arrived { run, extension, facts, key, fingerprint } = *arrived;
+        let prefix = store::run_prefix(run);
+        let t = self.db.write().await?;
+        if let Some(job) = self.made_before(&*t, key, fingerprint).await? {
+            // The same request came twice at the same time, and the other one was first; or this is the second try
+            // of a commit that was made.
+            if job.run_id != run {
+                queue::mark_unpublished(&*t, prefix, now_ms()).await?;
+                t.commit().await?;
+            }
+            return Ok(Some(job.run_id));
         }
         insert_asset(&*t, &new.asset).await?;
         rigs::keep_if_new(&*t, &new.rig).await?;
         let now = now_ms();
         let row = run::ActiveModel {
-            id: Set(run.clone()),
+            id: Set(run.into()),
             created_ms: Set(now),
             asset: Set(new.asset),
             chainage_mm: Set(new.chainage_mm),
@@ -151,9 +180,9 @@ impl Runs {
             recorded_ms: Set(new.recorded_ms.unwrap_or(now)),
             note: Set(new.note),
             filename: Set(new.filename),
-            source_extension: Set(extension),
-            source_bytes: Set(to_i64(incoming.facts.bytes)),
-            source_sha256: Set(incoming.facts.sha256.clone()),
+            source_extension: Set(extension.into()),
+            source_bytes: Set(to_i64(facts.bytes)),
+            source_sha256: Set(facts.sha256.clone()),
             fps: Set(new.fps),
             rig_name: Set(new.rig.name.clone()),
             state: Set(JobState::Queued.as_str().into()),
@@ -161,7 +190,7 @@ impl Runs {
         };
         run::Entity::insert(row).exec_without_returning(&*t).await?;
         let job = NewJob {
-            run: run.clone(),
+            run: run.into(),
             priority: Priority::Upload,
             rig_name: new.rig.name,
             rig_toml: new.rig.toml,
@@ -172,8 +201,7 @@ impl Runs {
         remember(&*t, key, fingerprint, &job).await?;
         unpublished::Entity::delete_by_id(prefix).exec(&*t).await?;
         t.commit().await?;
-        self.queue.bell().ring();
-        Ok(Created { made: self.get(&run).await?, repeated: false })
+        Ok(None)
     }
 
     /// Processes a run again: what is not said stays as in its latest job.
@@ -185,8 +213,20 @@ impl Runs {
         priority: Priority,
         key: Option<&str>,
     ) -> Result<Created<wire::Job>> {
+        let again = || self.try_reprocess(run_id, rig.clone(), recipe.clone(), priority, key);
+        retried(ANSWER_PATIENCE, again).await
+    }
+
+    async fn try_reprocess(
+        &self,
+        run_id: &str,
+        rig: Option<RigText>,
+        recipe: Option<RecipeText>,
+        priority: Priority,
+        key: Option<&str>,
+    ) -> Result<Created<wire::Job>> {
         let t = self.db.write().await?;
-        let row = self.row(&*t, run_id).await?;
+        let row = self.row_to_change(&*t, run_id).await?;
         let Some(latest) = job::Entity::find_by_id(&row.latest_job).one(&*t).await? else {
             return Err(Error::Internal(format!("run {run_id} has no job")));
         };
@@ -207,7 +247,7 @@ impl Runs {
             recipe_toml: recipe.toml,
         };
         let job = self.queue.enqueue(&*t, new).await?;
-        remember(&*t, key, fingerprint, &job).await?;
+        remember(&*t, key, &fingerprint, &job).await?;
         t.commit().await?;
         self.queue.bell().ring();
         Ok(Created { made: self.job(&job).await?, repeated: false })
@@ -229,8 +269,12 @@ impl Runs {
 
     /// Changes what is said about a run.
     pub async fn change(&self, id: &str, change: RunChange) -> Result<wire::Run> {
+        retried(ANSWER_PATIENCE, || self.try_change(id, change.clone())).await
+    }
+
+    async fn try_change(&self, id: &str, change: RunChange) -> Result<wire::Run> {
         let t = self.db.write().await?;
-        let row = self.row(&*t, id).await?;
+        let row = self.row_to_change(&*t, id).await?;
         let mut set = run::ActiveModel { id: Set(row.id), note: Set(row.note), ..Default::default() };
         if let Some(name) = change.asset {
             let name = name.trim().to_string();
@@ -261,8 +305,12 @@ impl Runs {
 
     /// Deletes a run with its jobs and all their files. A worker that is at one of them loses its lease and stops.
     pub async fn delete(&self, id: &str) -> Result<()> {
+        retried(ANSWER_PATIENCE, || self.try_delete(id)).await
+    }
+
+    async fn try_delete(&self, id: &str) -> Result<()> {
         let t = self.db.write().await?;
-        let row = self.row(&*t, id).await?;
+        let row = self.row_to_change(&*t, id).await?;
         for job in job::Entity::find().filter(job::Column::RunId.eq(id)).all(&*t).await? {
             let running = queue::state_of(&job)? == JobState::Running;
             let due_ms = now_ms() + if running { STOPPING_MS } else { 0 };
@@ -295,6 +343,12 @@ impl Runs {
         found.ok_or_else(|| Error::NotFound { what: "run", id: id.into() })
     }
 
+    /// A run, held until the end of the transaction.
+    async fn row_to_change(&self, records: &impl ConnectionTrait, id: &str) -> Result<run::Model> {
+        let found = run::Entity::find_by_id(id).lock_exclusive().one(records).await?;
+        found.ok_or_else(|| Error::NotFound { what: "run", id: id.into() })
+    }
+
     /// The job that an earlier request with the same key and content made.
     async fn made_before(
         &self,
@@ -311,12 +365,12 @@ impl Runs {
     }
 }
 
-async fn remember(records: &impl ConnectionTrait, key: Option<&str>, fingerprint: String, job: &str) -> Result<()> {
+async fn remember(records: &impl ConnectionTrait, key: Option<&str>, fingerprint: &str, job: &str) -> Result<()> {
     let Some(key) = key else { return Ok(()) };
     let row = idempotency_key::ActiveModel {
         key: Set(key.into()),
         created_ms: Set(now_ms()),
-        fingerprint: Set(fingerprint),
+        fingerprint: Set(fingerprint.into()),
         job_id: Set(job.into()),
     };
     idempotency_key::Entity::insert(row).exec_without_returning(records).await?;

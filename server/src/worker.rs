@@ -16,8 +16,8 @@ use tokio::task::JoinSet;
 use tokio_util::sync::CancellationToken;
 
 use crate::config::JobLimits;
-use crate::db::Db;
 use crate::db::tables::worker;
+use crate::db::{ANSWER_PATIENCE, Db, retried};
 use crate::error::Result;
 use crate::queue::{LeaseWatch, Queue};
 use crate::store::Store;
@@ -63,7 +63,7 @@ impl Worker {
             tracing::info!(lost, "jobs of a process that was killed went back to the queue");
         }
         scratch::remove_leftovers(&self.scratch, &self.queue).await?;
-        self.announce(slots).await?;
+        retried(ANSWER_PATIENCE, || self.announce(slots)).await?;
         let mut tasks = JoinSet::new();
         for _ in 0..slots {
             tasks.spawn(self.clone().work());
@@ -75,6 +75,10 @@ impl Worker {
                 tracing::error!(%error, "a worker stopped");
             }
         }
+        retried(self.limits.stop_patience, || self.sign_off()).await
+    }
+
+    async fn sign_off(&self) -> Result<()> {
         let t = self.db.write().await?;
         worker::Entity::delete_by_id(&self.name).exec(&*t).await?;
         t.commit().await

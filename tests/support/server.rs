@@ -18,6 +18,7 @@ const PATIENCE: Duration = Duration::from_secs(60);
 pub struct Server {
     data: TempDir,
     flags: Vec<String>,
+    variables: Vec<(String, String)>,
     process: Option<Child>,
     url: String,
     client: Client,
@@ -29,10 +30,19 @@ impl Server {
     /// # Panics
     /// Where it does not become ready.
     pub fn start(flags: &[&str]) -> Server {
+        Server::start_with(flags, &[])
+    }
+
+    /// Starts one on a new folder, with variables in its environment.
+    ///
+    /// # Panics
+    /// Where it does not become ready.
+    pub fn start_with(flags: &[&str], variables: &[(String, String)]) -> Server {
         let client = Client::builder().timeout(PATIENCE).build().expect("a client");
         let mut server = Server {
             data: tempfile::tempdir().expect("a temporary folder"),
             flags: flags.iter().map(ToString::to_string).collect(),
+            variables: variables.to_vec(),
             process: None,
             url: String::new(),
             client,
@@ -50,7 +60,8 @@ impl Server {
             .args(["serve", "--listen", "127.0.0.1:0", "--data"])
             .arg(self.data())
             .args(&self.flags)
-            .env("STRIA_LOG", "warn")
+            .env("STRIA_LOG", std::env::var("STRIA_LOG").unwrap_or_else(|_| "warn".into()))
+            .envs(self.variables.iter().map(|(name, value)| (name, value)))
             .stdout(Stdio::piped())
             .spawn()
             .expect("the server starts");
@@ -169,16 +180,31 @@ impl Server {
         }
     }
 
+    /// Its process.
+    ///
+    /// # Panics
+    /// Where it does not run.
+    pub fn id(&self) -> u32 {
+        self.process.as_ref().expect("it runs").id()
+    }
+
     /// The child processes that work on jobs.
     ///
     /// # Panics
     /// Where it does not run.
     pub fn children(&self) -> Vec<u32> {
-        let own = self.process.as_ref().expect("it runs").id();
-        let entries = std::fs::read_dir("/proc").expect("Linux");
-        let ids = entries.flatten().filter_map(|e| e.file_name().to_str()?.parse::<u32>().ok());
-        ids.filter(|id| parent_of(*id) == Some(own)).collect()
+        children_of(self.id())
     }
+}
+
+/// The living children of a process.
+///
+/// # Panics
+/// Where there is no /proc.
+pub fn children_of(parent: u32) -> Vec<u32> {
+    let entries = std::fs::read_dir("/proc").expect("Linux");
+    let ids = entries.flatten().filter_map(|e| e.file_name().to_str()?.parse::<u32>().ok());
+    ids.filter(|id| parent_of(*id) == Some(parent)).collect()
 }
 
 impl Drop for Server {

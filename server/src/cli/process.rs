@@ -183,7 +183,7 @@ pub(super) fn stop_on_signals(stop: Arc<AtomicBool>) -> Result<(), Failed> {
     let runtime = tokio::runtime::Builder::new_current_thread().enable_io().build().map_err(failed)?;
     let mut signals = {
         let _inside = runtime.enter();
-        super::serve::StopSignals::listen().map_err(failed)?
+        super::engine::StopSignals::listen().map_err(failed)?
     };
     let listen = move || {
         runtime.block_on(async {

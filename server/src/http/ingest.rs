@@ -91,7 +91,7 @@ async fn receive_raw(app: &App, parts: &axum::http::request::Parts, mut body: Bo
         fields.take(app, &name, &value).await?;
     }
     fields.check_complete()?;
-    let mut receiver = Receiver::start(&app.config.incoming(), app.config.requests.upload_bytes);
+    let mut receiver = Receiver::start(&app.config.places.incoming(), app.config.requests.upload_bytes);
     while let Some(chunk) = body.chunk(app.config.requests.sender_silence).await? {
         receiver.push(chunk).await?;
     }
@@ -132,7 +132,7 @@ async fn receive_form(app: &App, parts: &axum::http::request::Parts, body: Body)
             return Err(Error::field("file", "the form has more than one file", "one part named 'file'"));
         }
         fields.file_name(form::given_name(part.headers()).as_deref());
-        let mut receiver = Receiver::start(&app.config.incoming(), limits.upload_bytes);
+        let mut receiver = Receiver::start(&app.config.places.incoming(), limits.upload_bytes);
         while let Some(chunk) = next_chunk(&mut part, limits.sender_silence).await? {
             receiver.push(chunk).await?;
         }

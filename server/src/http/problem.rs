@@ -29,6 +29,11 @@ impl IntoResponse for Error {
             tracing::error!(%detail, "the disk is full");
             return answer(StatusCode::INSUFFICIENT_STORAGE, "storage-full", "The server's disk is full", detail, true);
         }
+        if self.is_passing() {
+            tracing::warn!(%detail, "the records or the store do not answer");
+            return Error::Busy("the server's records or files do not answer; come back in a moment".into())
+                .into_response();
+        }
         match self {
             Error::NotFound { .. } => {
                 answer(StatusCode::NOT_FOUND, "not-found", "Nothing of that name exists", detail, false)

@@ -1,6 +1,8 @@
 //! What the owner of a lease may write: signs of life, progress, segments, log lines, and one end.
 
-use sea_orm::sea_query::Expr;
+use std::sync::atomic::{AtomicBool, Ordering};
+
+use sea_orm::sea_query::{Expr, OnConflict};
 use sea_orm::{
     ActiveValue::Set, ColumnTrait, Condition, ConnectionTrait, EntityTrait, ExprTrait, PaginatorTrait, QueryFilter,
     QuerySelect,
@@ -9,6 +11,7 @@ use uuid::Uuid;
 
 use super::{Queue, mark_unpublished, repeat_in_run};
 use crate::config::JobLimits;
+use crate::db::retried;
 use crate::db::tables::{job, log_line, product, run, segment, unpublished};
 use crate::error::{Error, Result};
 use crate::store::{self, Facts, ProductName};
@@ -38,6 +41,8 @@ pub struct Lease {
     pub filename: String,
     /// The extension of the source's key.
     pub source_extension: String,
+    /// The source's size and hash.
+    pub source: Facts,
     /// Frames a second, where the sender said so.
     pub fps: Option<f64>,
     /// When the run was recorded, ms since 1970.
@@ -55,6 +60,7 @@ impl Lease {
             recipe_toml: job.recipe_toml,
             filename: run.filename,
             source_extension: run.source_extension,
+            source: Facts { bytes: run.source_bytes.unsigned_abs(), sha256: run.source_sha256 },
             fps: run.fps,
             recorded_ms: run.recorded_ms,
         }
@@ -168,6 +174,10 @@ impl Queue {
 
     /// A recording segment lies in the store.
     pub async fn segment(&self, lease: &Lease, number: u32, facts: &Facts) -> Result<()> {
+        retried(self.limits.record_patience, || self.try_segment(lease, number, facts)).await
+    }
+
+    async fn try_segment(&self, lease: &Lease, number: u32, facts: &Facts) -> Result<()> {
         let t = self.db.write().await?;
         lease_holds(&*t, lease).await?;
         let row = segment::ActiveModel {
@@ -177,7 +187,9 @@ impl Queue {
             bytes: Set(to_i64(facts.bytes)),
             sha256: Set(facts.sha256.clone()),
         };
-        segment::Entity::insert(row).exec_without_returning(&*t).await?;
+        // Its commit may have been made before the connection broke.
+        let there = OnConflict::columns([segment::Column::JobId, segment::Column::Number]).do_nothing().to_owned();
+        segment::Entity::insert(row).on_conflict(there).try_insert().exec_without_returning(&*t).await?;
         t.commit().await?;
         self.bell.ring();
         Ok(())
@@ -195,6 +207,32 @@ impl Queue {
 
     /// Publishes the result: state, products and the right to keep their files, at once.
     pub async fn finish(&self, lease: &Lease, outcome: Outcome) -> Result<()> {
+        // A connection that breaks in the commit leaves open whether it was made.
+        let unsure = AtomicBool::new(false);
+        let publish = || async {
+            match self.try_finish(lease, outcome.clone()).await {
+                Err(Error::LeaseLost) if unsure.load(Ordering::Relaxed) => self.is_published(lease).await,
+                Err(error) => {
+                    unsure.store(error.is_passing(), Ordering::Relaxed);
+                    Err(error)
+                }
+                done => done,
+            }
+        };
+        retried(self.limits.record_patience, publish).await
+    }
+
+    /// Whether this very attempt has published the result.
+    async fn is_published(&self, lease: &Lease) -> Result<()> {
+        let published = job::Entity::find_by_id(&lease.job)
+            .filter(job::Column::ResultFence.eq(lease.fence))
+            .filter(job::Column::State.eq(JobState::Done.as_str()))
+            .count(self.db.read())
+            .await?;
+        must_hold(published)
+    }
+
+    async fn try_finish(&self, lease: &Lease, outcome: Outcome) -> Result<()> {
         let t = self.db.write().await?;
         let count = outcome.products.len();
         let warnings: Vec<_> = outcome.warnings.into_iter().take(self.limits.warnings).collect();
@@ -232,6 +270,10 @@ impl Queue {
 
     /// The attempt ended in an error: back to the queue after a wait, or the job's end.
     pub async fn fail(&self, lease: &Lease, failure: &Failure) -> Result<()> {
+        retried(self.limits.record_patience, || self.try_fail(lease, failure)).await
+    }
+
+    async fn try_fail(&self, lease: &Lease, failure: &Failure) -> Result<()> {
         let t = self.db.write().await?;
         let row = lease_holds(&*t, lease).await?;
         let failures = row.failures + 1;
@@ -253,6 +295,10 @@ impl Queue {
 
     /// The attempt stopped because someone asked for it.
     pub async fn cancelled(&self, lease: &Lease) -> Result<()> {
+        retried(self.limits.record_patience, || self.try_cancelled(lease)).await
+    }
+
+    async fn try_cancelled(&self, lease: &Lease) -> Result<()> {
         let t = self.db.write().await?;
         lease_holds(&*t, lease).await?;
         self.leave(&*t, lease, ended(JobState::Cancelled), JobState::Cancelled).await?;
@@ -263,6 +309,10 @@ impl Queue {
 
     /// The worker stops cleanly: back to the queue, and the attempt is not counted.
     pub async fn release(&self, lease: &Lease) -> Result<()> {
+        retried(self.limits.record_patience, || self.try_release(lease)).await
+    }
+
+    async fn try_release(&self, lease: &Lease) -> Result<()> {
         let t = self.db.write().await?;
         let row = lease_holds(&*t, lease).await?;
         let change = job::ActiveModel { attempt: Set(row.attempt - 1), not_before_ms: Set(0), ..requeued() };
@@ -270,6 +320,16 @@ impl Queue {
         t.commit().await?;
         self.bell.ring();
         Ok(())
+    }
+
+    /// The lease was lost: what its attempt has put into the store since belongs to nothing.
+    pub async fn abandon(&self, lease: &Lease) -> Result<()> {
+        let t = self.db.write().await?;
+        let published = job::Entity::find_by_id(&lease.job).filter(job::Column::ResultFence.eq(lease.fence));
+        if published.lock_exclusive().one(&*t).await?.is_none() {
+            mark_unpublished(&*t, store::attempt_prefix(&lease.job, lease.fence), now_ms()).await?;
+        }
+        t.commit().await
     }
 
     /// What all ends without a result have in common.
@@ -368,7 +428,7 @@ pub(super) async fn add_log_line(
 }
 
 async fn lease_holds(records: &impl ConnectionTrait, lease: &Lease) -> Result<job::Model> {
-    job::Entity::find().filter(lease.held()).one(records).await?.ok_or(Error::LeaseLost)
+    job::Entity::find().filter(lease.held()).lock_exclusive().one(records).await?.ok_or(Error::LeaseLost)
 }
 
 fn must_hold(rows: u64) -> Result<()> {

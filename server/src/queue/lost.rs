@@ -1,13 +1,14 @@
 //! Leases whose worker is gone: found at the next start of its node, or by watching for signs of life.
 
 use std::collections::HashMap;
-use std::time::Instant;
+use std::time::{Duration, Instant};
 
 use sea_orm::{ActiveValue::Set, ColumnTrait, Condition, EntityTrait, QueryFilter, QuerySelect};
 
 use super::lease::{add_log_line, ended, problem_of, requeued};
 use super::{Queue, mark_unpublished, repeat_in_run};
 use crate::db::tables::{job, segment};
+use crate::db::{ANSWER_PATIENCE, retried};
 use crate::error::Result;
 use crate::store;
 use crate::wire::JobState;
@@ -24,7 +25,8 @@ impl Queue {
             Condition::all().add(job::Column::State.eq(JobState::Running.as_str())).add(job::Column::Node.eq(node));
         let mut lost = 0;
         for row in job::Entity::find().filter(held).all(self.db.read()).await? {
-            lost += usize::from(self.lose(&row.id, row.fence, row.beat, now_ms()).await?);
+            let lose = || self.lose(&row.id, row.fence, row.beat, now_ms());
+            lost += usize::from(retried(ANSWER_PATIENCE, lose).await?);
         }
         Ok(lost)
     }
@@ -37,7 +39,7 @@ impl Queue {
             .add(job::Column::State.eq(JobState::Running.as_str()))
             .add(job::Column::Fence.eq(fence))
             .add(job::Column::Beat.eq(beat));
-        let Some(row) = job::Entity::find().filter(held).one(&*t).await? else { return Ok(false) };
+        let Some(row) = job::Entity::find().filter(held).lock_exclusive().one(&*t).await? else { return Ok(false) };
         let losses = row.losses + 1;
         let state = match (row.cancel_requested, losses >= self.limits.max_losses) {
             (0, false) => JobState::Queued,
@@ -76,15 +78,19 @@ impl Queue {
 
 /// Watches the running jobs of all nodes. Time is this process's own monotonic clock: only the count of signs of life
 /// is read from the records, so that no clock that someone sets can end a lease.
+///
+/// Who was not looking saw no sign of life either: after this process was paused, or the records were away, every
+/// lease is watched for its whole time anew.
 pub struct LeaseWatch {
     queue: Queue,
     last_change: HashMap<String, (i64, i64, Instant)>,
+    last_look: Instant,
 }
 
 impl LeaseWatch {
     /// Begins to watch.
     pub fn new(queue: Queue) -> LeaseWatch {
-        LeaseWatch { queue, last_change: HashMap::new() }
+        LeaseWatch { queue, last_change: HashMap::new(), last_look: Instant::now() }
     }
 
     /// One look; takes back the leases that were silent for too long.
@@ -97,18 +103,27 @@ impl LeaseWatch {
             .all(self.queue.db.read())
             .await?;
         let now = Instant::now();
+        let looked_away = now.duration_since(self.last_look) > self.longest_gap();
+        self.last_look = now;
         let mut seen = HashMap::with_capacity(rows.len());
         for (id, fence, beat) in rows {
             let since = match self.last_change.get(&id) {
-                Some((f, b, since)) if (*f, *b) == (fence, beat) => *since,
+                Some((f, b, since)) if (*f, *b) == (fence, beat) && !looked_away => *since,
                 _ => now,
             };
             if now.duration_since(since) >= self.queue.limits.lease {
-                self.queue.lose(&id, fence, beat, now_ms() + LOST_FILES_MS).await?;
+                let lose = || self.queue.lose(&id, fence, beat, now_ms() + LOST_FILES_MS);
+                if retried(ANSWER_PATIENCE, lose).await? {
+                    tracing::warn!(job = id, "a lease without a sign of life was ended");
+                }
             }
             seen.insert(id, (fence, beat, since));
         }
         self.last_change = seen;
         Ok(())
+    }
+    /// The longest time between two looks after which what was seen still counts.
+    fn longest_gap(&self) -> Duration {
+        self.queue.limits.lease / 2
     }
 }

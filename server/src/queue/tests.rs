@@ -5,6 +5,7 @@ use std::time::Duration;
 use sea_orm::{ActiveValue::Set, ColumnTrait, EntityTrait, QueryFilter};
 
 use super::*;
+use crate::db::DatabasePlace;
 use crate::db::tables::{asset, product};
 use crate::store::{Facts, ProductName};
 use crate::wire::child::Failure;
@@ -17,7 +18,7 @@ struct Records {
 
 async fn records(limits: JobLimits) -> Records {
     let folder = tempfile::tempdir().expect("folder");
-    let db = Db::open_sqlite(&folder.path().join("stria.db")).await.expect("opens");
+    let db = Db::open(&DatabasePlace::Sqlite(folder.path().join("stria.db"))).await.expect("opens");
     let row = asset::ActiveModel { name: Set("wall".into()), created_ms: Set(0) };
     asset::Entity::insert(row).exec_without_returning(db.read()).await.expect("inserts");
     Records { queue: Queue::new(db.clone(), limits), db, _folder: folder }
@@ -60,7 +61,7 @@ impl Records {
     }
 
     async fn job(&self, id: &str) -> job::Model {
-        find(self.db.read(), id).await.expect("exists")
+        find_to_change(self.db.read(), id).await.expect("exists")
     }
 
     async fn unpublished(&self) -> Vec<(String, i64)> {
@@ -196,23 +197,43 @@ async fn a_job_that_always_takes_its_worker_along_ends() {
     assert_eq!(r.job(&id).await.state, "failed");
 }
 
+/// Looks at the leases so often that it has never looked away.
+async fn look_for(watch: &mut LeaseWatch, time: Duration) {
+    let begun = std::time::Instant::now();
+    while begun.elapsed() < time {
+        watch.look().await.expect("looks");
+        tokio::time::sleep(Duration::from_millis(10)).await;
+    }
+}
+
 #[tokio::test]
 async fn silence_ends_a_lease_and_a_sign_of_life_keeps_it() {
-    let r = records(JobLimits { lease: Duration::from_millis(80), ..fast() }).await;
+    let lease_time = Duration::from_millis(400);
+    let r = records(JobLimits { lease: lease_time, ..fast() }).await;
     let id = r.add(Priority::Upload).await;
     let lease = r.claim().await.expect("a job");
     let mut watch = LeaseWatch::new(r.queue.clone());
     for _ in 0..4 {
-        watch.look().await.expect("looks");
-        tokio::time::sleep(Duration::from_millis(30)).await;
+        look_for(&mut watch, lease_time / 3).await;
         r.queue.beat(&lease).await.expect("still mine");
     }
-    watch.look().await.expect("looks");
     assert_eq!(r.job(&id).await.state, "running");
-    tokio::time::sleep(Duration::from_millis(100)).await;
-    watch.look().await.expect("looks");
+    look_for(&mut watch, lease_time * 2).await;
     assert_eq!(r.job(&id).await.state, "queued");
     assert_eq!(r.queue.signal(&lease).await.expect("asks"), Signal::Lost);
+}
+
+#[tokio::test]
+async fn who_looked_away_ends_no_lease() {
+    let r = records(JobLimits { lease: Duration::from_millis(100), ..fast() }).await;
+    let id = r.add(Priority::Upload).await;
+    r.claim().await.expect("a job");
+    let mut watch = LeaseWatch::new(r.queue.clone());
+    for _ in 0..3 {
+        watch.look().await.expect("looks");
+        tokio::time::sleep(Duration::from_millis(150)).await;
+    }
+    assert_eq!(r.job(&id).await.state, "running", "its worker may have been there all the time");
 }
 
 #[tokio::test]

@@ -1,7 +1,9 @@
 //! Pages and filters: every list goes by a cursor and a bounded limit, on an index.
 
+use sea_orm::sea_query::{Expr, Func};
 use sea_orm::{
-    ColumnTrait, Condition, EntityTrait, Order, PaginatorTrait, QueryFilter, QueryOrder, QuerySelect, sea_query,
+    ColumnTrait, Condition, EntityTrait, ExprTrait, Order, PaginatorTrait, QueryFilter, QueryOrder, QuerySelect,
+    sea_query,
 };
 
 use super::{Runs, read_time, to_u64};
@@ -71,10 +73,15 @@ impl RunFilter {
             all = all.add(run::Column::State.eq(read_state(state)?.as_str()));
         }
         if let Some(q) = self.q.as_ref().filter(|q| !q.is_empty()) {
-            let like = sea_query::LikeExpr::new(format!("%{}%", escaped(q))).escape('\\');
-            let any = [run::Column::Asset, run::Column::Filename, run::Column::Note, run::Column::RigName]
-                .into_iter()
-                .fold(Condition::any(), |any, column| any.add(column.like(like.clone())));
+            // PostgreSQL's LIKE tells capitals from small letters, SQLite's only outside ASCII, as does its `lower`.
+            let columns = [run::Column::Asset, run::Column::Filename, run::Column::Note, run::Column::RigName];
+            let mut any = Condition::any();
+            for text in [q.to_lowercase(), q.to_ascii_lowercase()] {
+                let like = sea_query::LikeExpr::new(format!("%{}%", escaped(&text))).escape('\\');
+                for column in columns {
+                    any = any.add(Expr::expr(Func::lower(Expr::col(column))).like(like.clone()));
+                }
+            }
             all = all.add(any);
         }
         if let Some(from) = &self.from {

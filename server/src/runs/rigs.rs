@@ -7,6 +7,7 @@ use stria_core::rig::Rig;
 
 use super::{Page, Runs, check_name, shorten};
 use crate::db::tables::rig;
+use crate::db::{ANSWER_PATIENCE, retried};
 use crate::error::{Error, Result};
 use crate::store::sha256_of;
 use crate::wire::time::{now_ms, to_text};
@@ -109,23 +110,25 @@ impl Runs {
 
     /// Stores a rig. A stored rig never changes: a new calibration has a new name.
     pub async fn store_rig(&self, new: &RigText) -> Result<(wire::Rig, bool)> {
-        let t = self.db.write().await?;
-        let there = rig::Entity::find_by_id(&new.name).one(&*t).await?;
-        let made = there.is_none();
-        match there {
-            Some(row) if row.toml != new.toml => {
-                return Err(Error::Conflict(format!(
-                    "there is another rig '{}' with other values; stored rigs do not change: give the new calibration a name of its own",
-                    new.name
-                )));
-            }
-            Some(_) => {}
-            None => keep_if_new(&*t, new).await?,
-        }
-        t.commit().await?;
+        let made = retried(ANSWER_PATIENCE, || self.keep_rig(new)).await?;
         let row = rig::Entity::find_by_id(&new.name).one(self.db.read()).await?;
         let row = row.ok_or_else(|| Error::NotFound { what: "rig", id: new.name.clone() })?;
+        if row.toml != new.toml {
+            return Err(Error::Conflict(format!(
+                "there is another rig '{}' with other values; stored rigs do not change: give the new calibration a name of its own",
+                new.name
+            )));
+        }
         Ok((rig_of(row)?, made))
+    }
+
+    /// True where there was none of that name.
+    async fn keep_rig(&self, new: &RigText) -> Result<bool> {
+        let t = self.db.write().await?;
+        let there = rig::Entity::find_by_id(&new.name).one(&*t).await?;
+        keep_if_new(&*t, new).await?;
+        t.commit().await?;
+        Ok(there.is_none())
     }
 
     /// A stored rig.

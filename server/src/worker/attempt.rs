@@ -39,10 +39,35 @@ pub(super) async fn run(worker: &Worker, lease: &Lease) {
         Err(error) => Ended::Failed(Failure::new("io", error.to_string(), true)),
     };
     heart.abort();
-    let written = match ended {
+    let written = tokio::select! {
+        written = write_down(worker, lease, ended) => written,
+        () = stopped_for(worker, worker.limits.stop_patience) => {
+            Err(Error::Internal("the worker stops and the records do not answer".into()))
+        }
+    };
+    match written {
+        Ok(()) => {}
+        Err(Error::LeaseLost) => {
+            tracing::warn!(job = %lease.job, "the lease was lost; the attempt counts for nothing");
+            if let Err(error) = worker.queue.abandon(lease).await {
+                tracing::warn!(job = %lease.job, %error, "files of a lost attempt may stay behind");
+            }
+        }
+        // The lease runs out or is taken back at the next start; then the job is tried again.
+        Err(error) => tracing::error!(job = %lease.job, %error, "the end of an attempt could not be written"),
+    }
+    // Only now: a file of this name is what tells a leftover from an attempt that still runs.
+    Scratch::remove(&worker.scratch, lease).await;
+}
+
+/// The one end of an attempt into the records.
+async fn write_down(worker: &Worker, lease: &Lease, ended: Ended) -> Result<()> {
+    match ended {
         Ended::Done(outcome) => {
-            tracing::info!(job = %lease.job, products = outcome.products.len(), "done");
-            worker.queue.finish(lease, outcome).await
+            let products = outcome.products.len();
+            worker.queue.finish(lease, outcome).await?;
+            tracing::info!(job = %lease.job, products, "done");
+            Ok(())
         }
         Ended::Failed(failure) => {
             tracing::warn!(job = %lease.job, kind = failure.kind, message = failure.message, "failed");
@@ -51,15 +76,13 @@ pub(super) async fn run(worker: &Worker, lease: &Lease) {
         Ended::Cancelled => worker.queue.cancelled(lease).await,
         Ended::Released => worker.queue.release(lease).await,
         Ended::Lost => Err(Error::LeaseLost),
-    };
-    match written {
-        Ok(()) => {}
-        Err(Error::LeaseLost) => tracing::warn!(job = %lease.job, "the lease was lost; the attempt counts for nothing"),
-        // The lease runs out or is taken back at the next start; then the job is tried again.
-        Err(error) => tracing::error!(job = %lease.job, %error, "the end of an attempt could not be written"),
     }
-    // Only now: a file of this name is what tells a leftover from an attempt that still runs.
-    Scratch::remove(&worker.scratch, lease).await;
+}
+
+/// Returns when the worker was asked to stop so long ago.
+async fn stopped_for(worker: &Worker, time: Duration) {
+    worker.stop.cancelled().await;
+    tokio::time::sleep(time).await;
 }
 
 /// Signs of life and the answer to them, apart from the work.
@@ -77,7 +100,9 @@ fn beat(worker: &Worker, lease: &Lease) -> (watch::Receiver<Signal>, tokio::task
                 }
                 queue.signal(&lease).await
             };
-            match signal.await {
+            // An answer that does not come must not keep the next sign of life from being given.
+            let answer = tokio::time::timeout(limits.lease / 2, signal).await;
+            match answer.unwrap_or_else(|_| Err(Error::Busy("the records do not answer".into()))) {
                 Ok(signal) => drop(sender.send(signal)),
                 Err(Error::LeaseLost) => drop(sender.send(Signal::Lost)),
                 // The records may be back in a moment; if they are not, the lease runs out.
@@ -89,9 +114,14 @@ fn beat(worker: &Worker, lease: &Lease) -> (watch::Receiver<Signal>, tokio::task
 }
 
 async fn work(worker: &Worker, lease: &Lease, mut signals: watch::Receiver<Signal>) -> Result<Ended> {
-    worker.queue.log(lease, &format!("attempt {} begins on worker '{}'", lease.attempt, worker.name)).await?;
+    let begins = format!("attempt {} begins on worker '{}'", lease.attempt, worker.name);
+    may_pass(worker.queue.log(lease, &begins).await)?;
     let scratch = Scratch::make(&worker.scratch, lease).await?;
-    let source = worker.store.local_file(&Key::source(&lease.run, &lease.source_extension))?;
+    let key = Key::source(&lease.run, &lease.source_extension);
+    let source = tokio::select! {
+        copied = worker.store.local_copy(&key, &lease.source, scratch.folder()) => copied?,
+        ended = interrupted(worker, &mut signals) => return Ok(ended),
+    };
     let mut child = Child::start(worker, lease, &scratch, &source)?;
     let deadline = Instant::now() + worker.limits.time_limit;
     let mut teller =
@@ -116,10 +146,21 @@ async fn work(worker: &Worker, lease: &Lease, mut signals: watch::Receiver<Signa
         }
     };
     let storing = Progress { stage: STORING.into(), fraction: 1.0, time_left_s: None, ..teller.progress };
-    worker.queue.progress(lease, &storing).await?;
+    may_pass(worker.queue.progress(lease, &storing).await)?;
     tokio::select! {
         outcome = publish::store(worker, lease, &scratch, *manifest) => Ok(Ended::Done(outcome?)),
         ended = interrupted(worker, &mut signals) => Ok(ended),
+    }
+}
+
+/// What is only for watching may be missed while the records are away.
+fn may_pass(written: Result<()>) -> Result<()> {
+    match written {
+        Err(error) if error.is_passing() => {
+            tracing::warn!(%error, "progress could not be told");
+            Ok(())
+        }
+        other => other,
     }
 }
 
@@ -164,9 +205,11 @@ impl Teller<'_> {
                     return Ok(());
                 }
                 self.told = Some(Instant::now());
-                queue.progress(self.lease, &self.progress).await
+                may_pass(queue.progress(self.lease, &self.progress).await)
             }
-            Said::Event(Event::Warning { message }) => queue.log(self.lease, &format!("warning: {message}")).await,
+            Said::Event(Event::Warning { message }) => {
+                may_pass(queue.log(self.lease, &format!("warning: {message}")).await)
+            }
             Said::Event(Event::Segment { number, path, .. }) => {
                 publish::segment(self.worker, self.lease, self.scratch, number, &path).await
             }
@@ -175,7 +218,7 @@ impl Teller<'_> {
                 if self.stderr_lines > limits.stderr_lines {
                     return Ok(());
                 }
-                queue.log(self.lease, &line).await
+                may_pass(queue.log(self.lease, &line).await)
             }
         }
     }

@@ -2,6 +2,7 @@
 
 use std::path::{Component, Path};
 
+use futures::stream::{StreamExt, TryStreamExt};
 use stria_core::export::manifest::{FileEntry, Manifest};
 
 use super::Worker;
@@ -9,6 +10,9 @@ use super::scratch::Scratch;
 use crate::error::{Error, Result};
 use crate::queue::{Lease, Outcome, PublishedProduct};
 use crate::store::{Facts, Key, ProductName, facts_of};
+
+/// Products on their way into the store at the same time: to S3, waiting costs more than sending.
+const FILES_AT_ONCE: usize = 8;
 
 /// The list of the products is a product itself, and the only one that cannot list its own hash.
 const MANIFEST: &str = "manifest.json";
@@ -27,20 +31,20 @@ pub(super) async fn store(worker: &Worker, lease: &Lease, scratch: &Scratch, man
     }
     // A person looks for the files first; the tiles are for programs.
     products.sort_by_key(|p| p.name.as_str().contains('/'));
-    for product in &products {
-        let file = out.join(product.name.as_str());
-        check_plain_file(&out, &file, product.facts.bytes).await?;
-        let key = Key::product(&lease.job, lease.fence, &product.name);
-        worker.store.take_file(&file, &key).await?;
-        let stored = worker.store.size(&key).await?;
-        if stored != product.facts.bytes {
-            let (name, listed) = (product.name.as_str(), product.facts.bytes);
-            return Err(Error::Internal(format!("{name} has {stored} bytes in the store, {listed} in the manifest")));
-        }
-    }
+    // As a list: the compiler cannot tell that a closure's futures may go from thread to thread.
+    let into_store: Vec<_> = products.iter().map(|product| put(worker, lease, &out, product)).collect();
+    futures::stream::iter(into_store).buffer_unordered(FILES_AT_ONCE).try_collect::<()>().await?;
     worker.store.sync().await?;
     let quality = serde_json::to_value(&manifest.quality).map_err(|e| Error::Internal(format!("quality: {e}")))?;
     Ok(Outcome { products, warnings: manifest.warnings, quality, frames: manifest.quality.frames })
+}
+
+/// Checks a product and puts it into the store.
+async fn put(worker: &Worker, lease: &Lease, out: &Path, product: &PublishedProduct) -> Result<()> {
+    let file = out.join(product.name.as_str());
+    check_plain_file(out, &file, product.facts.bytes).await?;
+    let key = Key::product(&lease.job, lease.fence, &product.name);
+    worker.store.take_file(&file, &key, &product.facts).await
 }
 
 /// Puts a recording segment into the store while the child goes on.

@@ -1,0 +1,88 @@
+//! `stria work`: workers on another machine, on the records and the store that the servers use.
+
+use std::io::Write;
+use std::path::PathBuf;
+
+use clap::Args;
+use tokio_util::sync::CancellationToken;
+
+use super::engine::{Engine, JobArgs, PlaceArgs, StopSignals, block_on, log_to_stderr, slots};
+use super::{Failed, Outcome, Success};
+use crate::config::{JobLimits, Places};
+use crate::db::DatabasePlace;
+use crate::error::Error;
+use crate::store::StorePlace;
+
+/// Work on the jobs of servers on other machines
+#[derive(Args)]
+#[command(after_help = "Example: stria work --database postgres://stria@db/stria --store s3://walls\n\
+                        Stop with Ctrl-C or SIGTERM: running jobs go back to the queue.")]
+pub(super) struct Work {
+    #[command(flatten)]
+    places: PlaceArgs,
+    /// Jobs at the same time [default: one per two processors]
+    #[arg(long, value_name = "N", env = "STRIA_SLOTS")]
+    slots: Option<usize>,
+    /// This worker's own folder: scratch space, and the name by which it finds its jobs again after a crash
+    #[arg(long, value_name = "DIR", default_value = "stria-work", env = "STRIA_DATA")]
+    data: PathBuf,
+    #[command(flatten)]
+    jobs: JobArgs,
+}
+
+impl Work {
+    pub(super) fn run(self) -> Outcome {
+        log_to_stderr();
+        let places = self.places.places(&self.data)?;
+        let own = Places::in_folder(&self.data);
+        // What lies in the worker's own folder no server can see.
+        if matches!(places.database, DatabasePlace::Sqlite(_)) {
+            return Err(Failed::Input(format!(
+                "--database {}: SQLite serves one machine; expected the servers' postgres://USER:PASSWORD@HOST/NAME \
+                 (on one machine, `stria serve` works itself)",
+                places.database
+            )));
+        }
+        if places.store == own.store {
+            return Err(Failed::Input("--store is missing; expected the servers' s3://BUCKET/PREFIX or folder".into()));
+        }
+        if let StorePlace::Folder(folder) = &places.store
+            && !folder.is_dir()
+        {
+            return Err(Failed::Input(format!("--store {}: there is no such folder", folder.display())));
+        }
+        let slots = slots("--slots", self.slots)?;
+        if slots == 0 {
+            return Err(Failed::Input("--slots is 0; expected at least 1".into()));
+        }
+        block_on(work(places, self.jobs.limits()?, slots)).map(|()| Success::Done)
+    }
+}
+
+async fn work(places: Places, limits: JobLimits, slots: usize) -> Result<(), Failed> {
+    let failed = |e: Error| Failed::Other(e.to_string());
+    let stop = CancellationToken::new();
+    let mut signals = StopSignals::listen().map_err(|e| Failed::Other(format!("signals cannot be heard: {e}")))?;
+    let engine = Engine::start(&places, &limits).await.map_err(failed)?;
+    engine.store.ping().await.map_err(|e| Failed::Other(format!("--store {}: {e}", places.store)))?;
+    let worker = engine.worker(&stop).map_err(failed)?;
+    println!("Worker {} takes {slots} jobs at a time from {}", worker.name, places.database);
+    let _ = std::io::stdout().flush();
+    let mut work = tokio::spawn(worker.run(slots));
+    let ended = tokio::select! {
+        ended = &mut work => ended,
+        () = signals.next() => {
+            tracing::info!("stopping: running jobs go back to the queue");
+            stop.cancel();
+            tokio::select! {
+                ended = &mut work => ended,
+                () = signals.next() => std::process::exit(130),
+            }
+        }
+    };
+    match ended {
+        Ok(result) => result.map_err(failed)?,
+        Err(e) => return Err(Failed::Other(format!("the workers stopped: {e}"))),
+    }
+    engine.db.close().await.map_err(failed)
+}
