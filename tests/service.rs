@@ -5,6 +5,7 @@ mod service {
     mod commands;
     mod crashes;
     mod jobs;
+    mod measure;
     mod refusals;
     mod uploads;
 }

@@ -9,6 +9,7 @@ pub(crate) mod canvas;
 pub mod cloud_ply;
 pub mod depth_png;
 pub mod depth_tif;
+pub mod live_frame;
 pub mod manifest;
 pub mod new_file;
 pub mod npy;

@@ -90,7 +90,8 @@ pub struct Request {
     pub out_dir: PathBuf,
     /// The products to make.
     pub products: Vec<ProductGroup>,
-    /// Also write numbered recording segments to `recording/` inside `out_dir` while the work goes on.
+    /// Also write what people watch while the work goes on: numbered recording segments to `recording/` inside
+    /// `out_dir`, the newest frame to `live/`.
     pub live_segments: bool,
 }
 
@@ -145,6 +146,11 @@ pub enum Event {
         path: String,
         /// Its size.
         bytes: u64,
+    },
+    /// Files for those who watch are new or have changed: tiles, the newest frame.
+    Files {
+        /// Paths inside the product folder; those that describe others come last.
+        names: Vec<String>,
     },
 }
 

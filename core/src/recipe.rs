@@ -238,7 +238,7 @@ recipe! {
         /// Widest gap between two profiles that the map fills (method `metric`); what is wider stays a hole.
         bridge_mm: f64 = 25.0, "mm", number(0.0, 10000.0);
         /// Frames after which changed tiles are written while the run goes on.
-        tile_frames: u32 = 120, "frames", whole(1, 100000);
+        tile_frames: u32 = 60, "frames", whole(1, 100000);
     }
     /// The rerun recording.
     recording: RecordingOptions {

@@ -7,16 +7,20 @@ mod events;
 mod extract;
 mod files;
 mod form;
+mod growing;
 mod guard;
 mod health;
 mod ingest;
 mod jobs;
 mod lists;
+mod measure;
 mod page;
 mod problem;
 mod recording;
 mod rigs;
 mod runs;
+mod squeeze;
+mod stored;
 
 use std::sync::Arc;
 
@@ -83,6 +87,10 @@ fn routes() -> OpenApiRouter<App> {
         .routes(routes!(recording::get_recording))
         .routes(routes!(recording::get_segment))
         .routes(routes!(jobs::get_archive))
+        .routes(routes!(measure::get_profile))
+        .routes(routes!(measure::get_trajectory))
+        .routes(routes!(growing::get_tile))
+        .routes(routes!(growing::get_live_frame))
         .routes(routes!(rigs::list_rigs, rigs::create_rig))
         .routes(routes!(rigs::get_rig))
         .routes(routes!(lists::list_assets))
@@ -113,6 +121,7 @@ pub fn router(app: App) -> Router {
         .route("/api/{*rest}", axum::routing::any(unknown))
         .merge(page::routes())
         .method_not_allowed_fallback(wrong_method)
+        .layer(middleware::from_fn(squeeze::squeeze_json))
         .layer(middleware::from_fn_with_state(app.clone(), guard::answer_in_time))
         .layer(middleware::from_fn_with_state(app.clone(), guard::own_origin_only))
         .layer(middleware::map_response(guard::safe_headers))

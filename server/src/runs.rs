@@ -9,7 +9,7 @@ use sea_orm::sea_query::OnConflict;
 use sea_orm::{ActiveValue::Set, ColumnTrait, ConnectionTrait, EntityTrait, QueryFilter, QuerySelect};
 
 pub use jobs::content_type;
-pub use listing::{Page, RunFilter};
+pub use listing::{Page, RunFilter, RunSort};
 pub use rigs::{RecipeText, RigText, built_in_recipes, options};
 
 use crate::db::tables::{asset, idempotency_key, job, log_line, product, run, segment, unpublished};

@@ -158,6 +158,15 @@ impl Store {
         Ok(self.objects.head(&self.path(key)).await?.size)
     }
 
+    /// A small file as it is at one moment although another may take its place; `None` where there is none.
+    pub async fn find_bytes(&self, key: &Key, most_bytes: u64) -> Result<Option<Bytes>> {
+        match self.get_bytes(key, most_bytes).await {
+            Ok(bytes) => Ok(Some(bytes)),
+            Err(Error::Store(object_store::Error::NotFound { .. })) => Ok(None),
+            Err(error) => Err(error),
+        }
+    }
+
     /// Deletes everything under a prefix that this module made.
     pub async fn delete_prefix(&self, prefix: &str) -> Result<()> {
         let listed: Vec<_> = self.objects.list(Some(&self.prefixed(prefix))).try_collect().await?;
@@ -167,6 +176,18 @@ impl Store {
             match one {
                 Ok(_) | Err(object_store::Error::NotFound { .. }) => {}
                 Err(e) => return Err(e.into()),
+            }
+        }
+        // A process that was killed while it put a file leaves a piece under a name that no list shows.
+        if let Some(root) = self.folder() {
+            let folder = root.join(prefix);
+            let removed = blocking({
+                let folder = folder.clone();
+                move || std::fs::remove_dir_all(folder)
+            });
+            match removed.await? {
+                Err(e) if e.kind() != std::io::ErrorKind::NotFound => return Err(Error::io(folder, e)),
+                _ => {}
             }
         }
         Ok(())

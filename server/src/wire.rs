@@ -5,6 +5,7 @@
 pub mod child;
 mod job;
 mod lists;
+mod measure;
 mod run;
 pub mod time;
 
@@ -13,6 +14,7 @@ pub use lists::{
     Asset, AssetPage, Health, JobPage, LogPage, OptionRange, ProductPage, Recipe, RecipeOption, Rig, RigPage, RunPage,
     Worker,
 };
+pub use measure::{CrossSection, Trajectory};
 pub use run::{Direction, Run, RunChange, RunSource};
 
 use serde::{Deserialize, Serialize};

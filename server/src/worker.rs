@@ -7,6 +7,7 @@ mod attempt;
 mod child;
 mod publish;
 mod scratch;
+mod showcase;
 
 use std::path::PathBuf;
 use std::time::Duration;

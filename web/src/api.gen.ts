@@ -97,11 +97,29 @@ export interface paths {
             cookie?: never;
         };
         /**
-         * Events of a job: `state` (the job), `progress` (the job), `log` (a line), `segment` (a recording segment).
+         * Events of a job: `state` (the job), `progress` (the job), `log` (a line), `segment` (a recording segment),
+         *     `tile` (the `revision` of a pyramid that grows: its `tiles.json` names what changed).
          * @description The present state, the log and all segments so far come first. When a segment's `generation` grows, the recording
          *     has started anew. The stream ends after a final state.
          */
         get: operations["stream_events"];
+        put?: never;
+        post?: never;
+        delete?: never;
+        options?: never;
+        head?: never;
+        patch?: never;
+        trace?: never;
+    };
+    "/api/jobs/{job}/live/{name}": {
+        parameters: {
+            query?: never;
+            header?: never;
+            path?: never;
+            cookie?: never;
+        };
+        /** The newest frame of a job that runs: `frame.jpg`, small, and `frame.json` with the stripe found in it. */
+        get: operations["get_live_frame"];
         put?: never;
         post?: never;
         delete?: never;
@@ -161,6 +179,23 @@ export interface paths {
         patch?: never;
         trace?: never;
     };
+    "/api/jobs/{job}/profile": {
+        parameters: {
+            query?: never;
+            header?: never;
+            path?: never;
+            cookie?: never;
+        };
+        /** A cross-section of the depth map, in mm: the map's own values along a line, the nearest pixel's at each point. */
+        get: operations["get_profile"];
+        put?: never;
+        post?: never;
+        delete?: never;
+        options?: never;
+        head?: never;
+        patch?: never;
+        trace?: never;
+    };
     "/api/jobs/{job}/recording": {
         parameters: {
             query?: never;
@@ -206,6 +241,43 @@ export interface paths {
         put?: never;
         /** Puts a failed or cancelled job back to the queue. */
         post: operations["retry_job"];
+        delete?: never;
+        options?: never;
+        head?: never;
+        patch?: never;
+        trace?: never;
+    };
+    "/api/jobs/{job}/tiles/{name}": {
+        parameters: {
+            query?: never;
+            header?: never;
+            path?: never;
+            cookie?: never;
+        };
+        /**
+         * The maps' pyramid: `tiles.json`, `depth/{level}/{column}_{row}.png`, `texture/{level}/{column}_{row}.jpg`. While the job
+         *     runs, its state so far: `tiles.json` counts `revision` and names what changed; a `tile` event says when to look.
+         */
+        get: operations["get_tile"];
+        put?: never;
+        post?: never;
+        delete?: never;
+        options?: never;
+        head?: never;
+        patch?: never;
+        trace?: never;
+    };
+    "/api/jobs/{job}/trajectory": {
+        parameters: {
+            query?: never;
+            header?: never;
+            path?: never;
+            cookie?: never;
+        };
+        /** `trajectory.csv` as columns, thinned for plots. */
+        get: operations["get_trajectory"];
+        put?: never;
+        post?: never;
         delete?: never;
         options?: never;
         head?: never;
@@ -288,7 +360,7 @@ export interface paths {
             path?: never;
             cookie?: never;
         };
-        /** Runs, the newest first. */
+        /** Runs, the newest first or in another order. */
         get: operations["list_runs"];
         put?: never;
         /**
@@ -430,6 +502,31 @@ export interface components {
             items: components["schemas"]["Asset"][];
             /** @description Pass it as `cursor` for the next page; absent on the last. */
             next_cursor?: string | null;
+        };
+        /** @description A cross-section of a depth map: one entry a point in every list. */
+        CrossSection: {
+            /** @description Position along the asset, mm. */
+            chainage_mm: number[];
+            /** @description Way along the line since its beginning, mm. */
+            distance_mm: number[];
+            /** @description The job whose map it is. */
+            job: string;
+            /**
+             * Format: double
+             * @description Size of the map's pixel, mm.
+             */
+            mm_per_px: number;
+            /**
+             * Format: double
+             * @description Way from one point to the next, mm.
+             */
+            step_mm: number;
+            /** @description World x, mm. */
+            x_mm: number[];
+            /** @description World y, mm. */
+            y_mm: number[];
+            /** @description World z as `depth.tif` has it at the nearest pixel, mm; null where nothing was measured. */
+            z_mm: (number | null)[];
         };
         /**
          * @description Which way the robot went along the asset.
@@ -762,6 +859,25 @@ export interface components {
             /** @description Where to get it back, byte for byte. */
             url: string;
         };
+        /** @description A job's trajectory as columns, one entry a frame in every list. */
+        Trajectory: {
+            /** @description `trajectory.csv`'s columns by their names; null where a value was not determined. */
+            columns: {
+                [key: string]: (number | null)[];
+            };
+            /**
+             * Format: int64
+             * @description Every n-th frame is here.
+             */
+            every: number;
+            /**
+             * Format: int64
+             * @description Frames of the run.
+             */
+            frames: number;
+            /** @description The job. */
+            job: string;
+        };
         /** @description A worker process and what it is at. */
         Worker: {
             /** @description The jobs it is at. */
@@ -1005,6 +1121,45 @@ export interface operations {
             };
         };
     };
+    get_live_frame: {
+        parameters: {
+            query?: never;
+            header?: never;
+            path: {
+                /** @description The job */
+                job: string;
+                /** @description frame.jpg or frame.json */
+                name: string;
+            };
+            cookie?: never;
+        };
+        requestBody?: never;
+        responses: {
+            200: {
+                headers: {
+                    [name: string]: unknown;
+                };
+                content: {
+                    "application/octet-stream": number[];
+                };
+            };
+            /** @description Not changed */
+            304: {
+                headers: {
+                    [name: string]: unknown;
+                };
+                content?: never;
+            };
+            404: {
+                headers: {
+                    [name: string]: unknown;
+                };
+                content: {
+                    "application/problem+json": components["schemas"]["Problem"];
+                };
+            };
+        };
+    };
     get_log: {
         parameters: {
             query?: {
@@ -1129,6 +1284,55 @@ export interface operations {
             };
         };
     };
+    get_profile: {
+        parameters: {
+            query?: {
+                /** @description Across the whole map at this chainage, mm. */
+                chainage_mm?: number;
+                /** @description Where a line begins: world x,y in mm; with `to`. */
+                from?: string;
+                /** @description Where it ends: world x,y in mm. */
+                to?: string;
+                /** @description Way from one point to the next, mm; the map's pixel when nothing is said, or longer for a long line. */
+                step_mm?: number;
+                /** @description `json` (when nothing is said) or `csv`. */
+                format?: string;
+            };
+            header?: never;
+            path: {
+                /** @description The job */
+                job: string;
+            };
+            cookie?: never;
+        };
+        requestBody?: never;
+        responses: {
+            200: {
+                headers: {
+                    [name: string]: unknown;
+                };
+                content: {
+                    "application/json": components["schemas"]["CrossSection"];
+                };
+            };
+            400: {
+                headers: {
+                    [name: string]: unknown;
+                };
+                content: {
+                    "application/problem+json": components["schemas"]["Problem"];
+                };
+            };
+            404: {
+                headers: {
+                    [name: string]: unknown;
+                };
+                content: {
+                    "application/problem+json": components["schemas"]["Problem"];
+                };
+            };
+        };
+    };
     get_recording: {
         parameters: {
             query?: never;
@@ -1234,6 +1438,93 @@ export interface operations {
                 };
             };
             409: {
+                headers: {
+                    [name: string]: unknown;
+                };
+                content: {
+                    "application/problem+json": components["schemas"]["Problem"];
+                };
+            };
+        };
+    };
+    get_tile: {
+        parameters: {
+            query?: never;
+            header?: never;
+            path: {
+                /** @description The job */
+                job: string;
+                /** @description Path below tiles/ */
+                name: string;
+            };
+            cookie?: never;
+        };
+        requestBody?: never;
+        responses: {
+            200: {
+                headers: {
+                    [name: string]: unknown;
+                };
+                content: {
+                    "application/octet-stream": number[];
+                };
+            };
+            /** @description A range of it */
+            206: {
+                headers: {
+                    [name: string]: unknown;
+                };
+                content?: never;
+            };
+            /** @description Not changed */
+            304: {
+                headers: {
+                    [name: string]: unknown;
+                };
+                content?: never;
+            };
+            404: {
+                headers: {
+                    [name: string]: unknown;
+                };
+                content: {
+                    "application/problem+json": components["schemas"]["Problem"];
+                };
+            };
+        };
+    };
+    get_trajectory: {
+        parameters: {
+            query?: {
+                /** @description Most frames to answer, 2 to 100,000; 2,000 when nothing is said. Of longer runs every n-th frame is answered. */
+                frames?: number;
+            };
+            header?: never;
+            path: {
+                /** @description The job */
+                job: string;
+            };
+            cookie?: never;
+        };
+        requestBody?: never;
+        responses: {
+            200: {
+                headers: {
+                    [name: string]: unknown;
+                };
+                content: {
+                    "application/json": components["schemas"]["Trajectory"];
+                };
+            };
+            400: {
+                headers: {
+                    [name: string]: unknown;
+                };
+                content: {
+                    "application/problem+json": components["schemas"]["Problem"];
+                };
+            };
+            404: {
                 headers: {
                     [name: string]: unknown;
                 };
@@ -1406,6 +1697,8 @@ export interface operations {
                 from?: string;
                 /** @description Recorded before this time (RFC 3339). */
                 to?: string;
+                /** @description `created`, `recorded` or `asset`, with a minus before it for the other way round; `-created` when nothing is said. */
+                sort?: string;
                 /** @description `next_cursor` of the page before. */
                 cursor?: string;
                 /** @description Most items, 1 to 1000; 50 when nothing is said. */

@@ -10,6 +10,7 @@
 //! all readers obey: GDAL takes ModelPixelScale's y for its absolute value, by long custom.
 
 mod container;
+pub mod section;
 
 use std::fs::File;
 use std::io::{BufReader, BufWriter, Seek, SeekFrom, Write};

@@ -9,6 +9,7 @@ mod furniture;
 mod layout;
 mod reduce;
 mod relief;
+mod thumbnail;
 
 use std::path::Path;
 
@@ -18,6 +19,7 @@ use crate::export::canvas::Canvas;
 
 use layout::{Layout, WIDTH_PX};
 use reduce::Reduced;
+use thumbnail::Thumbnail;
 
 /// Share of the depths beyond each end of the colours.
 const TAIL: f64 = 0.01;
@@ -51,6 +53,7 @@ struct Range {
 /// The picture in memory.
 pub struct Picture {
     canvas: Canvas,
+    thumbnail: Thumbnail,
 }
 
 impl Picture {
@@ -76,6 +79,14 @@ impl Picture {
     pub fn save(&self, path: &Path) -> Result<()> {
         self.canvas.save_png(path)
     }
+
+    /// Writes a small picture of the map alone, for lists, as a JPEG file.
+    ///
+    /// # Errors
+    /// What the disk says.
+    pub fn save_thumbnail(&self, path: &Path) -> Result<()> {
+        self.thumbnail.save(path)
+    }
 }
 
 /// Paints the picture.
@@ -83,10 +94,6 @@ impl Picture {
 /// # Errors
 /// An empty map; what the reading of the map says.
 pub fn picture(map: &mut dyn MapReader, text: &PreviewText) -> Result<Picture> {
-    paint(map, text).map(|canvas| Picture { canvas })
-}
-
-fn paint(map: &mut dyn MapReader, text: &PreviewText) -> Result<Canvas> {
     let geometry = map.geometry();
     if geometry.width_px == 0 || geometry.height_px == 0 {
         return Err(Error::internal("preview.png", "an empty map"));
@@ -96,9 +103,11 @@ fn paint(map: &mut dyn MapReader, text: &PreviewText) -> Result<Canvas> {
     let reduced = Reduced::read(map, factor)?;
     let range = colour_range(&reduced);
     let mut canvas = Canvas::new(WIDTH_PX, layout.height_px(), [255; 3])?;
-    draw_map(&mut canvas, &layout, &reduced, range);
+    let shades = relief::shade(&reduced);
+    draw_map(&mut canvas, &layout, &reduced, &shades, range);
     furniture::draw(&mut canvas, &furniture::Sheet { layout, geometry, text, range, coverage: reduced.coverage });
-    Ok(canvas)
+    let thumbnail = Thumbnail::of(&reduced, &shades, range);
+    Ok(Picture { canvas, thumbnail })
 }
 
 fn colour_range(map: &Reduced) -> Option<Range> {
@@ -107,9 +116,8 @@ fn colour_range(map: &Reduced) -> Option<Range> {
     Some(Range { near_mm: near_mm - widen_mm, far_mm: far_mm + widen_mm })
 }
 
-fn draw_map(canvas: &mut Canvas, layout: &Layout, map: &Reduced, range: Option<Range>) {
+fn draw_map(canvas: &mut Canvas, layout: &Layout, map: &Reduced, shades: &[f32], range: Option<Range>) {
     let range = range.unwrap_or(Range { near_mm: 0.0, far_mm: 1.0 });
-    let shades = relief::shade(map);
     let ramp = colour::Ramp::new();
     let scale = layout.mm_per_px / map.mm_per_px;
     for strip in 0..layout.strips {
@@ -126,7 +134,7 @@ fn draw_map(canvas: &mut Canvas, layout: &Layout, map: &Reduced, range: Option<R
                     continue;
                 }
                 let share = (f64::from(z_mm) - range.near_mm) / (range.far_mm - range.near_mm);
-                let shade = Reduced::at(&shades, map.width_px, map.height_px, x, y);
+                let shade = Reduced::at(shades, map.width_px, map.height_px, x, y);
                 canvas.blend(at_x, at_y, colour::shaded(ramp.at(share), shade), 1.0);
             }
         }

@@ -139,7 +139,7 @@ fn rows_of(pixels: &MapWindow, first_row_px: usize, height_px: usize) -> MapWind
 }
 
 /// Half the size; each pixel is the mean of those of its four that were measured.
-fn halved(pixels: &MapWindow) -> MapWindow {
+pub(super) fn halved(pixels: &MapWindow) -> MapWindow {
     let mut half = MapWindow::empty(pixels.width_px / 2, pixels.height_px / 2);
     for row in 0..half.height_px {
         for column in 0..half.width_px {

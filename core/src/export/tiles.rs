@@ -8,30 +8,35 @@
 //!
 //! Tiles are 256 × 256 px. Level 0 is full size, each further level half of the one before. Tile (0, 0) begins
 //! at the grid's origin, chosen when the run starts; a robot that goes backwards, or a wall that reaches
-//! higher, gives tiles with negative numbers, and no tile ever changes its number. While the run goes on there
-//! is only level 0, and tiles not yet there are missing; at the end every tile inside each level's range exists.
+//! higher, gives tiles with negative numbers, and no tile ever changes its number. While the run goes on the
+//! pyramid grows: `revision` counts its states, `changed` names the tiles that came or changed last, and tiles
+//! not yet there are missing; at the end every tile inside each level's range exists.
 
-use std::collections::HashMap;
+use std::collections::{BTreeSet, HashMap, VecDeque};
 use std::hash::{DefaultHasher, Hash, Hasher};
 use std::path::{Path, PathBuf};
 
 use png::{BitDepth, ColorType, Compression, Encoder};
 use serde::{Deserialize, Serialize};
 
-use crate::depth_map::{MapGeometry, MapReader, MapWindow, TILE_SIDE_PX};
+use crate::depth_map::{MapGeometry, MapReader, MapWindow, TILE_SIDE_PX, TileIndex};
 use crate::error::{Error, Result};
 use crate::export::new_file::{self, NewFile};
 use crate::export::pyramid::{self, Layout, TileAddress, tile_range};
 use crate::export::texture::small_jpeg;
 
 mod depth_range;
+mod growing;
 
 use depth_range::DepthHistogram;
+use growing::Growing;
 
 /// Depth of one step of a tile's value, mm.
 pub const STEP_MM: f64 = 0.001;
 /// Depth of value 0, if it were one, mm.
 pub const OFFSET_MM: f64 = -4000.0;
+/// So many changes are listed: who has missed more asks for every tile in view again.
+const CHANGES_LISTED: usize = 400;
 /// Largest value that 24 bits hold.
 const LARGEST_VALUE: f64 = 16_777_215.0;
 
@@ -84,6 +89,12 @@ pub struct TilesIndex {
     pub levels: Vec<TileLevel>,
     /// The part of the grid that is the map; known at the end.
     pub depth_map: Option<MapGeometry>,
+    /// Counts the states of a pyramid that grows.
+    #[serde(default)]
+    pub revision: u64,
+    /// The newest changes of a pyramid that grows, the newest last: revision, level, column, row.
+    #[serde(default)]
+    pub changed: VecDeque<[i64; 4]>,
 }
 
 impl TilesIndex {
@@ -101,8 +112,11 @@ pub struct TileWriter {
     folder: PathBuf,
     index: TilesIndex,
     depths: DepthHistogram,
+    growing: Growing,
+    /// Tiles of level 0 since the last [`TileWriter::publish`].
+    fresh: BTreeSet<TileIndex>,
     /// What each tile of level 0 held when it was last written.
-    written: HashMap<(i64, i64), u64>,
+    written: HashMap<TileIndex, u64>,
 }
 
 impl TileWriter {
@@ -119,8 +133,17 @@ impl TileWriter {
             depth_range_mm: None,
             levels: Vec::new(),
             depth_map: None,
+            revision: 0,
+            changed: VecDeque::new(),
         };
-        let writer = TileWriter { folder, index, depths: DepthHistogram::default(), written: HashMap::new() };
+        let writer = TileWriter {
+            folder,
+            index,
+            depths: DepthHistogram::default(),
+            growing: Growing::create(product_folder)?,
+            fresh: BTreeSet::new(),
+            written: HashMap::new(),
+        };
         writer.make_level_folders(0)?;
         writer.write_index()?;
         Ok(writer)
@@ -131,11 +154,41 @@ impl TileWriter {
     pub fn put(&mut self, column: i64, row: i64, tile: &MapWindow) -> Result<()> {
         self.depths.add(&tile.depth_mm);
         self.write_tile(TileAddress { level: 0, column, row }, tile)?;
-        if self.extend_level_0(column, row) {
-            self.index.depth_range_mm = self.depths.middle();
-            self.write_index()?;
-        }
+        self.growing.add(0, (column, row), tile)?;
+        self.fresh.insert((column, row));
         Ok(())
+    }
+
+    /// Brings the upper levels and `tiles.json` up to what was put. Answers what changed: names inside the product
+    /// folder, `tiles/tiles.json` last.
+    pub fn publish(&mut self) -> Result<Vec<String>> {
+        let mut fresh = std::mem::take(&mut self.fresh);
+        let Some(bottom) = self.extended(&fresh) else { return Ok(Vec::new()) };
+        self.index.revision += 1;
+        let mut names = Vec::new();
+        self.note(0, &fresh, &mut names);
+        let known = self.index.levels.len() as u32;
+        let count = growing::level_count(&bottom);
+        self.index.levels = (0..count).map(|level| level_above(&bottom, level)).collect();
+        for level in 1..count {
+            if level >= known {
+                self.make_level_folders(level)?;
+                // A level that begins is written whole.
+                fresh = all_tiles(&self.index.levels[level as usize]);
+            } else {
+                fresh = fresh.iter().map(|(column, row)| (column >> 1, row >> 1)).collect();
+            }
+            for (column, row) in &fresh {
+                let tile = self.growing.tile(level, (*column, *row))?;
+                self.write_tile(TileAddress { level, column: *column, row: *row }, &tile)?;
+                self.growing.add(level, (*column, *row), &tile)?;
+            }
+            self.note(level, &fresh, &mut names);
+        }
+        self.index.depth_range_mm = self.depths.middle();
+        self.write_index()?;
+        names.push("tiles/tiles.json".into());
+        Ok(names)
     }
 
     /// Completes the pyramid from the finished map: every level, and what of level 0 differs from what is there.
@@ -159,6 +212,8 @@ impl TileWriter {
         self.index.depth_range_mm = self.depths.middle();
         self.index.depth_map = Some(geometry);
         self.index.complete = true;
+        self.index.revision += 1;
+        self.index.changed.clear();
         self.write_index()
     }
 
@@ -178,8 +233,9 @@ impl TileWriter {
         put_file(&place("texture", "jpg"), &small_jpeg(TILE_SIDE_PX, TILE_SIDE_PX, &tile.texture)?)
     }
 
-    /// Says whether the range of tiles grew.
-    fn extend_level_0(&mut self, column: i64, row: i64) -> bool {
+    /// Level 0's range with these tiles; `None` where there are none.
+    fn extended(&self, fresh: &BTreeSet<TileIndex>) -> Option<TileLevel> {
+        let (column, row) = fresh.first().copied()?;
         let alone = TileLevel {
             level: 0,
             mm_per_px: self.index.grid.mm_per_px,
@@ -188,16 +244,25 @@ impl TileWriter {
             first_row: row,
             last_row: row,
         };
-        let Some(level) = self.index.levels.first_mut() else {
-            self.index.levels.push(alone);
-            return true;
-        };
-        let before = *level;
-        level.first_column = level.first_column.min(column);
-        level.last_column = level.last_column.max(column);
-        level.first_row = level.first_row.min(row);
-        level.last_row = level.last_row.max(row);
-        before != *level
+        let mut level = self.index.levels.first().copied().unwrap_or(alone);
+        for (column, row) in fresh {
+            level.first_column = level.first_column.min(*column);
+            level.last_column = level.last_column.max(*column);
+            level.first_row = level.first_row.min(*row);
+            level.last_row = level.last_row.max(*row);
+        }
+        Some(level)
+    }
+
+    /// Lists tiles as changed.
+    fn note(&mut self, level: u32, tiles: &BTreeSet<TileIndex>, names: &mut Vec<String>) {
+        for (column, row) in tiles {
+            names.push(format!("tiles/depth/{level}/{column}_{row}.png"));
+            names.push(format!("tiles/texture/{level}/{column}_{row}.jpg"));
+            self.index.changed.push_back([self.index.revision as i64, i64::from(level), *column, *row]);
+        }
+        let too_many = self.index.changed.len().saturating_sub(CHANGES_LISTED);
+        self.index.changed.drain(..too_many);
     }
 
     fn make_level_folders(&self, level: u32) -> Result<()> {
@@ -208,7 +273,7 @@ impl TileWriter {
     }
 
     fn write_index(&self) -> Result<()> {
-        let text = serde_json::to_vec_pretty(&self.index).map_err(|e| Error::internal("tiles.json", e))?;
+        let text = serde_json::to_vec(&self.index).map_err(|e| Error::internal("tiles.json", e))?;
         new_file::write(&self.folder.join("tiles.json"), &text)
     }
 }
@@ -240,17 +305,32 @@ fn level_count(map: &MapGeometry) -> u32 {
 fn levels_of(map: &MapGeometry, grid: &TileGrid, layout: &Layout) -> Vec<TileLevel> {
     let columns = tile_range(layout.first_column_px, map.width_px, layout.side_px);
     let rows = tile_range(layout.first_row_px, map.height_px, layout.side_px);
-    (0..layout.levels)
-        .map(|level| TileLevel {
-            level,
-            mm_per_px: grid.mm_per_px * f64::from(1_u32 << level),
-            // A shift of a negative number rounds down: the tile that holds it.
-            first_column: columns.start >> level,
-            last_column: (columns.end - 1) >> level,
-            first_row: rows.start >> level,
-            last_row: (rows.end - 1) >> level,
-        })
-        .collect()
+    let bottom = TileLevel {
+        level: 0,
+        mm_per_px: grid.mm_per_px,
+        first_column: columns.start,
+        last_column: columns.end - 1,
+        first_row: rows.start,
+        last_row: rows.end - 1,
+    };
+    (0..layout.levels).map(|level| level_above(&bottom, level)).collect()
+}
+
+/// A level by level 0's range. A shift of a negative number rounds down: the tile that holds it.
+fn level_above(bottom: &TileLevel, level: u32) -> TileLevel {
+    TileLevel {
+        level,
+        mm_per_px: bottom.mm_per_px * f64::from(1_u32 << level),
+        first_column: bottom.first_column >> level,
+        last_column: bottom.last_column >> level,
+        first_row: bottom.first_row >> level,
+        last_row: bottom.last_row >> level,
+    }
+}
+
+fn all_tiles(level: &TileLevel) -> BTreeSet<TileIndex> {
+    let rows = level.first_row..=level.last_row;
+    (level.first_column..=level.last_column).flat_map(|column| rows.clone().map(move |row| (column, row))).collect()
 }
 
 fn content_hash(tile: &MapWindow) -> u64 {

@@ -11,6 +11,7 @@ use crate::depth_map::{FinishedMap, Grid, MapReader, SharedMap, SurfaceMap};
 use crate::error::{Error, Result};
 use crate::export::archive_mcap::ArchiveWriter;
 use crate::export::cloud_ply::CloudPlyWriter;
+use crate::export::live_frame::{self, LiveFrameWriter};
 use crate::export::manifest::{
     FileEntry, Gap, GrayScale, Manifest, Quality, SCHEMA_VERSION, list_products, sha256_of_bytes,
 };
@@ -40,6 +41,7 @@ pub(super) struct Products<'a> {
     stripes: Option<NpyWriter>,
     recorder: Option<Recorder>,
     archive: Option<ArchiveWriter>,
+    live: Option<LiveFrameWriter>,
     frames: u64,
 }
 
@@ -78,18 +80,20 @@ impl<'a> Products<'a> {
             })?,
             recorder: make(wanted(ProductGroup::Recording), recorder)?,
             archive: make(wanted(ProductGroup::Archive), archive)?,
+            live: make(request.live_segments, || LiveFrameWriter::create(folder))?,
             frames: 0,
         })
     }
 
-    /// Whether the recording shows the picture of a frame at this time.
+    /// Whether the picture of a frame at this time is shown: in the recording, or to those who watch.
     pub(super) fn wants_picture(&self, time_s: f64) -> bool {
         self.recorder.as_ref().is_some_and(|recorder| recorder.wants_image(time_s))
+            || self.live.as_ref().is_some_and(|live| live.due(time_s))
     }
 
-    /// Whether any product shows the frames themselves.
+    /// Whether the frames themselves are shown anywhere.
     pub(super) fn wants_pictures(&self) -> bool {
-        self.recorder.is_some()
+        self.recorder.is_some() || self.live.is_some()
     }
 
     /// Whether any product shows the wall's colours.
@@ -146,8 +150,21 @@ impl<'a> Products<'a> {
             })?;
             events = self.announcements(segments);
         }
-        self.write_changed_tiles()?;
+        let names: Vec<String> = [self.write_changed_tiles()?, self.write_live_frame(placed)?].concat();
+        if self.request.live_segments && !names.is_empty() {
+            events.push(Event::Files { names });
+        }
         Ok(events)
+    }
+
+    fn write_live_frame(&mut self, placed: &Placed<Cargo>) -> Result<Vec<String>> {
+        let (measured, cargo) = (&placed.measured, &placed.measured.cargo);
+        let (Some(live), Some(picture)) = (&mut self.live, &cargo.picture) else { return Ok(Vec::new()) };
+        if !live.due(measured.time_s) {
+            return Ok(Vec::new());
+        }
+        let x_mm = placed.world_from_camera.map(|pose| pose.translation.x);
+        live.put((measured.frame, measured.time_s), &picture.image, &cargo.stripe, x_mm)
     }
 
     fn add_to_map(&mut self, placed: &Placed<Cargo>, points: &[SurfacePoint]) -> Result<()> {
@@ -207,16 +224,16 @@ impl<'a> Products<'a> {
         Ok(())
     }
 
-    /// Hands tiles out while the run goes on, now and then, so that people can look.
-    fn write_changed_tiles(&mut self) -> Result<()> {
-        let (Some(map), Some(tiles)) = (&mut self.map, &mut self.tiles) else { return Ok(()) };
+    /// Hands tiles out while the run goes on, now and then, so that people can look. Answers what changed.
+    fn write_changed_tiles(&mut self) -> Result<Vec<String>> {
+        let (Some(map), Some(tiles)) = (&mut self.map, &mut self.tiles) else { return Ok(Vec::new()) };
         if !self.frames.is_multiple_of(u64::from(self.request.recipe.map.tile_frames)) {
-            return Ok(());
+            return Ok(Vec::new());
         }
         for index in map.take_changed() {
             tiles.put(index.0, index.1, &map.tile_window(index)?)?;
         }
-        Ok(())
+        tiles.publish()
     }
 
     fn announcements(&self, segments: Vec<Segment>) -> Vec<Event> {
@@ -279,6 +296,7 @@ impl<'a> Products<'a> {
         if let Some(warning) = archived {
             progress.warn(warning)?;
         }
+        live_frame::remove(&request.out_dir)?;
         progress.step("manifest")?;
         manifest.warnings = progress.warnings().to_vec();
         manifest.products = list_products(&request.out_dir)?;
@@ -312,6 +330,7 @@ impl<'a> Products<'a> {
                 let picture = preview::picture(&mut shared.reader(), &text)?;
                 if wants(ProductGroup::Preview) {
                     picture.save(&folder.join("preview.png"))?;
+                    picture.save_thumbnail(&folder.join("thumbnail.jpg"))?;
                 }
                 Ok(Some(picture))
             });

@@ -160,7 +160,7 @@ impl Process {
                 bar.show(&stage, fraction, frames, frames_total, frames_per_s, time_left_s);
             }
             Event::Warning { message } => bar.say(&format!("warning: {message}")),
-            Event::Segment { .. } => {}
+            Event::Segment { .. } | Event::Files { .. } => {}
         }
     }
 }

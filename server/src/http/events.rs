@@ -4,17 +4,18 @@
 //! The records are the truth: the stream compares them with what it has sent, and the bell only says when to look.
 
 use std::convert::Infallible;
-use std::time::Duration;
+use std::time::{Duration, Instant};
 
 use axum::extract::State;
 use axum::response::sse::{Event, KeepAlive, Sse};
 use axum::response::{IntoResponse, Response};
-use serde::Serialize;
+use serde::{Deserialize, Serialize};
 use tokio::sync::mpsc;
 use tokio_stream::wrappers::ReceiverStream;
 
 use super::App;
 use super::extract::Path;
+use super::growing::MOST_BYTES;
 use crate::error::{Error, Result};
 use crate::wire::{Job, JobState, Problem, RecordingSegment};
 
@@ -28,10 +29,13 @@ const KEEP_ALIVE: Duration = Duration::from_secs(15);
 const QUEUED_EVENTS: usize = 16;
 /// How long a browser waits before it comes back, ms.
 const COME_BACK: Duration = Duration::from_secs(2);
+/// Least time between two looks at the tiles of a job that runs.
+const TILES_EVERY: Duration = Duration::from_secs(1);
 /// Log lines and segments of one look.
 const AT_ONCE: u64 = 500;
 
-/// Events of a job: `state` (the job), `progress` (the job), `log` (a line), `segment` (a recording segment).
+/// Events of a job: `state` (the job), `progress` (the job), `log` (a line), `segment` (a recording segment),
+/// `tile` (the `revision` of a pyramid that grows: its `tiles.json` names what changed).
 ///
 /// The present state, the log and all segments so far come first. When a segment's `generation` grows, the recording
 /// has started anew. The stream ends after a final state.
@@ -65,6 +69,14 @@ struct Told {
     log_lines: i64,
     /// Generation and number of the newest segment.
     segment: Option<(u64, u32)>,
+    /// When the tiles were looked at, and their revision.
+    tiles: Option<(Instant, u64)>,
+}
+
+/// The part of `tiles.json` that says whether it has changed.
+#[derive(Deserialize, Serialize)]
+struct TilesState {
+    revision: u64,
 }
 
 struct Teller {
@@ -86,6 +98,7 @@ impl Teller {
             }
             self.tell_log().await?;
             self.tell_segments().await?;
+            self.tell_tiles().await?;
             self.tell_job(&job).await?;
             if job.state.is_final() || self.events.is_closed() {
                 return Ok(());
@@ -135,6 +148,25 @@ impl Teller {
             }
             self.told.segment = Some((last.generation, last.number));
         }
+    }
+
+    async fn tell_tiles(&mut self) -> Result<()> {
+        let known = match self.told.tiles {
+            Some((looked, _)) if looked.elapsed() < TILES_EVERY => return Ok(()),
+            Some((_, revision)) => revision,
+            None => 0,
+        };
+        let (key, published) = self.app.runs.growing_file(&self.job, "tiles/tiles.json").await?;
+        if published.is_some() {
+            return Ok(()); // the final state tells it
+        }
+        let Some(bytes) = self.app.store.find_bytes(&key, MOST_BYTES).await? else { return Ok(()) };
+        let Ok(state) = serde_json::from_slice::<TilesState>(&bytes) else { return Ok(()) };
+        if state.revision != known {
+            self.send("tile", &state).await?;
+        }
+        self.told.tiles = Some((Instant::now(), state.revision));
+        Ok(())
     }
 
     /// Waits for a slow reader; ends when there is none any more.

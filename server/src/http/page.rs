@@ -42,7 +42,8 @@ pub(super) fn routes() -> Router<App> {
 
 async fn get_page(uri: Uri, headers: HeaderMap) -> Result<Response> {
     let path = uri.path().trim_start_matches('/');
-    let exact = Page::get(path).map(|file| (path, file));
+    // The squeezed forms have no address of their own.
+    let exact = Page::get(path).filter(|_| !path.ends_with(".br")).map(|file| (path, file));
     // A missing file is missing; a missing address without an extension is the page's own business.
     let is_address = !path.rsplit('/').next().unwrap_or_default().contains('.');
     let index = || is_address.then(|| Page::get("index.html").map(|file| ("index.html", file))).flatten();
@@ -52,7 +53,7 @@ async fn get_page(uri: Uri, headers: HeaderMap) -> Result<Response> {
     // The page's build puts a hash of the content into the names below assets/.
     let cache = if name.starts_with("assets/") { IMMUTABLE } else { REVALIDATE };
     let name = name.to_string();
-    let asset = shared(&name, || Asset::new(&name, Bytes::from(file.data.into_owned())));
+    let asset = shared(&name, || Asset::new(&name, Bytes::from(file.data.into_owned()), brotli_of(&name)));
     asset.send(&headers, cache).await
 }
 
@@ -70,7 +71,13 @@ async fn get_viewer(Path(path): Path<String>, headers: HeaderMap) -> Result<Resp
         "re_viewer_bg.wasm" => data.viewer_wasm(),
         _ => return Err(missing()),
     };
-    shared(&format!("viewer/{name}"), || Asset::new(name, Bytes::from_static(bytes))).send(&headers, cache).await
+    let path = format!("viewer/{VIEWER_VERSION}/{name}");
+    shared(&path, || Asset::new(name, Bytes::from_static(bytes), brotli_of(&path))).send(&headers, cache).await
+}
+
+/// A file's brotli form, which the page's build makes: small, and slow to make.
+fn brotli_of(name: &str) -> Option<Bytes> {
+    Page::get(&format!("{name}.br")).map(|file| Bytes::from(file.data.into_owned()))
 }
 
 static VIEWER: LazyLock<std::result::Result<WebViewerData, String>> =
@@ -88,6 +95,7 @@ fn shared(name: &str, make: impl FnOnce() -> Asset) -> Arc<Asset> {
 struct Asset {
     content_type: &'static str,
     bytes: Bytes,
+    brotli: Option<Bytes>,
     made: OnceLock<Made>,
 }
 
@@ -98,7 +106,7 @@ struct Made {
 }
 
 impl Asset {
-    fn new(name: &str, bytes: Bytes) -> Asset {
+    fn new(name: &str, bytes: Bytes, brotli: Option<Bytes>) -> Asset {
         let content_type = match name.rsplit_once('.').map_or("", |(_, extension)| extension) {
             "html" => "text/html; charset=utf-8",
             "js" | "mjs" => "text/javascript; charset=utf-8",
@@ -112,7 +120,7 @@ impl Asset {
             "txt" => "text/plain; charset=utf-8",
             _ => "application/octet-stream",
         };
-        Asset { content_type, bytes, made: OnceLock::new() }
+        Asset { content_type, bytes, brotli, made: OnceLock::new() }
     }
 
     fn made(&self) -> &Made {
@@ -128,10 +136,12 @@ impl Asset {
             .await
             .map_err(|e| Error::Internal(format!("compressing stopped: {e}")))?;
         let made = self.made();
-        // The two forms are two representations, each with an ETag of its own (RFC 9110, section 8.8.3).
-        let gzip = made.gzip.as_ref().filter(|_| takes_gzip(asked));
-        let etag = match gzip {
-            Some(_) => format!("{}-gzip\"", made.etag.trim_end_matches('"')),
+        // Each form is a representation of its own, with its own ETag (RFC 9110, section 8.8.3).
+        let brotli = self.brotli.as_ref().filter(|_| takes("br", asked)).map(|bytes| ("br", bytes));
+        let gzip = || made.gzip.as_ref().filter(|_| takes("gzip", asked)).map(|bytes| ("gzip", bytes));
+        let squeezed = brotli.or_else(gzip);
+        let etag = match squeezed {
+            Some((form, _)) => format!("{}-{form}\"", made.etag.trim_end_matches('"')),
             None => made.etag.clone(),
         };
         let mut headers = HeaderMap::new();
@@ -145,9 +155,9 @@ impl Asset {
             return Ok((StatusCode::NOT_MODIFIED, headers).into_response());
         }
         headers.insert(CONTENT_TYPE, HeaderValue::from_static(self.content_type));
-        let body = match gzip {
-            Some(bytes) => {
-                headers.insert(CONTENT_ENCODING, HeaderValue::from_static("gzip"));
+        let body = match squeezed {
+            Some((form, bytes)) => {
+                headers.insert(CONTENT_ENCODING, HeaderValue::from_static(form));
                 bytes.clone()
             }
             None => self.bytes.clone(),
@@ -156,19 +166,20 @@ impl Asset {
     }
 }
 
-fn compressed(bytes: &[u8]) -> std::io::Result<Vec<u8>> {
+/// Gzip at the usual effort.
+pub(super) fn compressed(bytes: &[u8]) -> std::io::Result<Vec<u8>> {
     let mut encoder = flate2::write::GzEncoder::new(Vec::new(), flate2::Compression::default());
     encoder.write_all(bytes)?;
     encoder.finish()
 }
 
-/// `Accept-Encoding` takes gzip, and not with a weight of zero.
-fn takes_gzip(asked: &HeaderMap) -> bool {
+/// `Accept-Encoding` takes a form, and not with a weight of zero.
+pub(super) fn takes(form: &str, asked: &HeaderMap) -> bool {
     let items = asked.get_all(ACCEPT_ENCODING).iter().filter_map(|v| v.to_str().ok()).flat_map(|v| v.split(','));
     items.map(|item| item.split_once(';').map_or((item.trim(), ""), |(name, weight)| (name.trim(), weight.trim()))).any(
         |(name, weight)| {
             let refused = weight.strip_prefix("q=").and_then(|q| q.parse::<f32>().ok()) == Some(0.0);
-            name.eq_ignore_ascii_case("gzip") && !refused
+            name.eq_ignore_ascii_case(form) && !refused
         },
     )
 }
@@ -178,12 +189,15 @@ mod tests {
     use super::*;
 
     #[test]
-    fn gzip_is_sent_to_those_who_take_it() {
-        for (text, takes) in
-            [("gzip", true), ("br, GZIP;q=0.5", true), ("gzip;q=0", false), ("br", false), ("identity", false)]
-        {
+    fn squeezed_forms_are_sent_to_those_who_take_them() {
+        for (text, gzip, brotli) in [
+            ("gzip", true, false),
+            ("br, GZIP;q=0.5", true, true),
+            ("gzip;q=0, br", false, true),
+            ("identity", false, false),
+        ] {
             let headers = [(ACCEPT_ENCODING, text.parse().expect("value"))].into_iter().collect();
-            assert_eq!(takes_gzip(&headers), takes, "{text}");
+            assert_eq!((takes("gzip", &headers), takes("br", &headers)), (gzip, brotli), "{text}");
         }
     }
 

@@ -10,7 +10,7 @@ use super::extract::{Json, Path, Query};
 use super::files::{self, FileAnswer, IMMUTABLE};
 use super::{App, ingest};
 use crate::error::Result;
-use crate::runs::{Page, RecipeText, RunFilter, content_type};
+use crate::runs::{Page, RecipeText, RunFilter, RunSort, content_type};
 use crate::wire::{Job, Priority, Problem, Reprocess, Run, RunChange, RunPage};
 
 #[derive(Deserialize, IntoParams)]
@@ -27,18 +27,21 @@ pub(super) struct RunQuery {
     from: Option<String>,
     /// Recorded before this time (RFC 3339).
     to: Option<String>,
+    /// `created`, `recorded` or `asset`, with a minus before it for the other way round; `-created` when nothing is said.
+    sort: Option<String>,
     /// `next_cursor` of the page before.
     cursor: Option<String>,
     /// Most items, 1 to 1000; 50 when nothing is said.
     limit: Option<u64>,
 }
 
-/// Runs, the newest first.
+/// Runs, the newest first or in another order.
 #[utoipa::path(get, path = "/api/runs", tag = "runs", params(RunQuery),
     responses((status = 200, body = RunPage), (status = 400, body = Problem, content_type = "application/problem+json")))]
 pub(super) async fn list_runs(State(app): State<App>, Query(query): Query<RunQuery>) -> Result<Response> {
     let page = Page::new(query.cursor, query.limit)?;
-    let filter = RunFilter { asset: query.asset, state: query.state, q: query.q, from: query.from, to: query.to };
+    let sort = RunSort::parse(query.sort.as_deref())?;
+    let filter = RunFilter { asset: query.asset, state: query.state, q: query.q, from: query.from, to: query.to, sort };
     Ok(axum::Json(app.runs.list(&filter, &page).await?).into_response())
 }
 

@@ -66,6 +66,19 @@ impl Runs {
         }
     }
 
+    /// A file that people look at while the job runs: where it lies, and its facts once it is a product. While the job
+    /// runs there may be none at the place.
+    pub async fn growing_file(&self, job: &str, name: &str) -> Result<(Key, Option<Facts>)> {
+        let row = self.job_row(job).await?;
+        if row.result_fence.is_some() {
+            let product = self.product(job, name).await?;
+            return Ok((product.key, Some(product.facts)));
+        }
+        let missing = || Error::NotFound { what: "file", id: name.into() };
+        let name = ProductName::new(name).ok_or_else(missing)?;
+        Ok((Key::product(job, row.fence, &name), None))
+    }
+
     /// The recording so far.
     pub async fn recording(&self, job: &str) -> Result<wire::Recording> {
         const WHOLE: &str = "recording.rrd";

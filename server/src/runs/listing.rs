@@ -61,6 +61,82 @@ pub struct RunFilter {
     pub from: Option<String>,
     /// Recorded before this time.
     pub to: Option<String>,
+    /// In which order.
+    pub sort: RunSort,
+}
+
+/// The order of a list of runs. Each has an index, so that a page costs the same wherever it begins.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub struct RunSort {
+    by: RunKey,
+    falling: bool,
+}
+
+impl Default for RunSort {
+    fn default() -> RunSort {
+        RunSort { by: RunKey::Created, falling: true }
+    }
+}
+
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+enum RunKey {
+    Created,
+    Recorded,
+    Asset,
+}
+
+impl RunSort {
+    /// Reads a request's word: `created`, `recorded` or `asset`, with a minus for the other way round.
+    pub fn parse(text: Option<&str>) -> Result<RunSort> {
+        let Some(text) = text else { return Ok(RunSort::default()) };
+        let (falling, name) = text.strip_prefix('-').map_or((false, text), |name| (true, name));
+        let by = match name {
+            "created" => RunKey::Created,
+            "recorded" => RunKey::Recorded,
+            "asset" => RunKey::Asset,
+            _ => {
+                let expected = "created, -created, recorded, -recorded, asset or -asset";
+                return Err(Error::field("sort", format!("sort is {text:?}"), expected));
+            }
+        };
+        Ok(RunSort { by, falling })
+    }
+
+    fn column(self) -> Option<run::Column> {
+        match self.by {
+            RunKey::Created => None, // a run's name is ordered by its creation
+            RunKey::Recorded => Some(run::Column::RecordedMs),
+            RunKey::Asset => Some(run::Column::Asset),
+        }
+    }
+
+    /// What a cursor names: the run, behind the value that sorts it.
+    fn cursor(self, row: &run::Model) -> String {
+        match self.by {
+            RunKey::Created => row.id.clone(),
+            RunKey::Recorded => format!("{}|{}", row.recorded_ms, row.id),
+            RunKey::Asset => format!("{}|{}", row.asset, row.id),
+        }
+    }
+
+    /// The runs behind a cursor.
+    fn after(self, cursor: &str) -> Result<Condition> {
+        let beyond = |column: run::Column, value: sea_orm::Value| match self.falling {
+            true => column.lt(value),
+            false => column.gt(value),
+        };
+        let bad = || Error::field("cursor", format!("cursor is {cursor:?}"), "the `next_cursor` of the page before");
+        let Some(column) = self.column() else {
+            return Ok(Condition::all().add(beyond(run::Column::Id, cursor.into())));
+        };
+        let (value, id) = cursor.rsplit_once('|').ok_or_else(bad)?;
+        let value: sea_orm::Value = match self.by {
+            RunKey::Recorded => value.parse::<i64>().map_err(|_| bad())?.into(),
+            _ => value.into(),
+        };
+        let same = Condition::all().add(column.eq(value.clone())).add(beyond(run::Column::Id, id.into()));
+        Ok(Condition::any().add(beyond(column, value)).add(same))
+    }
 }
 
 impl RunFilter {
@@ -106,14 +182,19 @@ fn read_state(text: &str) -> Result<JobState> {
 }
 
 impl Runs {
-    /// Runs, the newest first.
+    /// Runs in the filter's order.
     pub async fn list(&self, filter: &RunFilter, page: &Page) -> Result<wire::RunPage> {
-        let mut query = run::Entity::find().filter(filter.condition()?).order_by(run::Column::Id, Order::Desc);
+        let (sort, mut query) = (filter.sort, run::Entity::find().filter(filter.condition()?));
+        let order = if sort.falling { Order::Desc } else { Order::Asc };
+        if let Some(column) = sort.column() {
+            query = query.order_by(column, order.clone());
+        }
+        query = query.order_by(run::Column::Id, order);
         if let Some(cursor) = &page.cursor {
-            query = query.filter(run::Column::Id.lt(cursor.as_str()));
+            query = query.filter(sort.after(cursor)?);
         }
         let mut rows = query.limit(page.limit + 1).all(self.db.read()).await?;
-        let next_cursor = page.next(&mut rows, |r| r.id.clone());
+        let next_cursor = page.next(&mut rows, |r| sort.cursor(r));
         let ids: Vec<_> = rows.iter().map(|r| r.latest_job.clone()).collect();
         let mut jobs: std::collections::HashMap<_, _> = job::Entity::find()
             .filter(job::Column::Id.is_in(ids))

@@ -8,6 +8,7 @@ use tokio::time::Instant;
 
 use super::child::{Child, Said};
 use super::scratch::Scratch;
+use super::showcase::Showcase;
 use super::{Worker, publish};
 use crate::error::{Error, Result};
 use crate::queue::{Lease, Outcome, Progress, Signal};
@@ -124,8 +125,15 @@ async fn work(worker: &Worker, lease: &Lease, mut signals: watch::Receiver<Signa
     };
     let mut child = Child::start(worker, lease, &scratch, &source)?;
     let deadline = Instant::now() + worker.limits.time_limit;
-    let mut teller =
-        Teller { worker, lease, scratch: &scratch, told: None, progress: Progress::default(), stderr_lines: 0 };
+    let mut teller = Teller {
+        worker,
+        lease,
+        scratch: &scratch,
+        showcase: Showcase::open(&worker.store, lease, &scratch),
+        told: None,
+        progress: Progress::default(),
+        stderr_lines: 0,
+    };
     let listened = async {
         while let Some(said) = child.next().await {
             teller.tell(said).await?;
@@ -145,6 +153,7 @@ async fn work(worker: &Worker, lease: &Lease, mut signals: watch::Receiver<Signa
             return Ok(ended);
         }
     };
+    teller.showcase.close().await;
     let storing = Progress { stage: STORING.into(), fraction: 1.0, time_left_s: None, ..teller.progress };
     may_pass(worker.queue.progress(lease, &storing).await)?;
     tokio::select! {
@@ -187,6 +196,8 @@ struct Teller<'a> {
     worker: &'a Worker,
     lease: &'a Lease,
     scratch: &'a Scratch,
+    /// What people see while the child goes on.
+    showcase: Showcase,
     /// When progress was last written.
     told: Option<Instant>,
     progress: Progress,
@@ -212,6 +223,10 @@ impl Teller<'_> {
             }
             Said::Event(Event::Segment { number, path, .. }) => {
                 publish::segment(self.worker, self.lease, self.scratch, number, &path).await
+            }
+            Said::Event(Event::Files { names }) => {
+                self.showcase.show(names);
+                Ok(())
             }
             Said::Stderr(line) => {
                 self.stderr_lines += 1;

@@ -59,6 +59,7 @@ fn tiles_can_be_read_while_the_run_goes_on_and_stale_ones_are_replaced() {
     early.depth_mm[0] = 123.0;
     writer.put(-1, 0, &early).expect("put");
     writer.put(0, 0, &early).expect("put");
+    writer.publish().expect("publish");
     let index = TilesIndex::load(folder.path()).expect("index");
     assert!(!index.complete && index.depth_map.is_none());
     assert_eq!((index.levels[0].first_column, index.levels[0].last_column), (-1, 0));
@@ -67,6 +68,45 @@ fn tiles_can_be_read_while_the_run_goes_on_and_stale_ones_are_replaced() {
     let mut map = map();
     writer.finish(&mut map).expect("finish");
     check_level_0(&map, 0, 0, &read_depth_tile(&path).expect("tile"));
+}
+
+#[test]
+fn upper_levels_grow_with_the_run_as_they_are_at_its_end() {
+    let (live, done) = (tempfile::tempdir().expect("folder"), tempfile::tempdir().expect("folder"));
+    let mut writer = TileWriter::create(live.path(), GRID).expect("create");
+    let mut map = map();
+    // Column by column, as a robot goes; the map's first pixel is the grid's (-150, -10).
+    let mut named = BTreeSet::new();
+    for column in -1..=2_i64 {
+        for row in -1..=1_i64 {
+            let mut tile = MapWindow::empty(256, 256);
+            for at in 0..256 * 256 {
+                let (c, r) = (column * 256 + (at % 256) as i64 + 150, row * 256 + (at / 256) as i64 + 10);
+                if (0..700).contains(&c) && (0..300).contains(&r) {
+                    tile.depth_mm[at] = map.pixels().depth_mm[(r * 700 + c) as usize];
+                }
+            }
+            writer.put(column, row, &tile).expect("put");
+        }
+        let names = writer.publish().expect("publish");
+        assert_eq!(names.last().map(String::as_str), Some("tiles/tiles.json"));
+        assert!(names.iter().all(|name| live.path().join(name).exists()));
+        named.extend(names);
+    }
+    assert!(writer.publish().expect("publish").is_empty(), "nothing new, nothing said");
+    TileWriter::create(done.path(), GRID).expect("create").finish(&mut map).expect("finish");
+    let (grown, end) = (TilesIndex::load(live.path()).expect("index"), TilesIndex::load(done.path()).expect("index"));
+    assert_eq!(grown.revision, 4);
+    assert_eq!(grown.levels.len(), end.levels.len());
+    for level in &end.levels[1..] {
+        for (column, row) in all_tiles(level) {
+            let name = format!("tiles/depth/{}/{column}_{row}.png", level.level);
+            assert!(named.contains(&name), "{name} was announced");
+            let read = |folder: &Path| read_depth_tile(&folder.join(&name)).expect("tile");
+            let same = |(a, b): (&f32, &f32)| a == b || (a.is_nan() && b.is_nan()) || (a - b).abs() < 0.0011;
+            assert!(read(live.path()).iter().zip(&read(done.path())).all(same), "{name}");
+        }
+    }
 }
 
 #[test]
