@@ -72,6 +72,9 @@ mod entity {
     pub(super) const GUIDE: &str = "guide";
 }
 
+/// Longest time between two live segments while the robot still walks, s.
+const WATCHED_SEGMENT_S: f64 = 0.25;
+
 /// Rows of plots that wait, at most, before they become a chunk.
 const ROWS_WAIT: usize = 512;
 
@@ -86,6 +89,8 @@ pub struct RecordedRun<'a> {
     pub frames_expected: Option<u64>,
     /// How long it will be, s, where the source says so.
     pub duration_expected_s: Option<f64>,
+    /// The robot is still walking: people want to see now what it sees.
+    pub watched: bool,
 }
 
 /// What the method made of one frame.
@@ -145,7 +150,8 @@ impl Recorder {
     ) -> Result<Recorder> {
         let id = StoreId::random(StoreKind::Recording, APPLICATION);
         let opening = blueprint::opening(&id, run.name, run.recorded_at)?;
-        let period = Duration::from_secs_f64(options.segment_s.clamp(0.01, 3600.0));
+        let longest_s = if run.watched { WATCHED_SEGMENT_S } else { 3600.0 };
+        let period = Duration::from_secs_f64(options.segment_s.clamp(0.01, longest_s));
         let live = segments_dir.map(|dir| LiveSegments::new(dir, period)).transpose()?;
         let mut budget = Budget::new(options.budget_mb);
         let mut recorder = Recorder {

@@ -1,10 +1,15 @@
-//! Where frames come from: video files, folders of images, one trait over both.
+//! Where frames come from: video files, folders of images, a run's segments in a folder that may still grow; one trait
+//! over all.
 
 mod encoded;
 mod folder;
+pub mod frame_file;
 mod image;
+pub mod segments;
+mod still;
 mod video;
 
+use std::io::Read;
 use std::path::{Path, PathBuf};
 use std::sync::Once;
 
@@ -12,6 +17,7 @@ pub use encoded::{EncodedFrames, encoded_frames};
 pub(crate) use image::shrunk;
 pub use image::{Image, PlaneView, Yuv};
 
+use self::segments::{Records, SegmentKind, StoredFrames, StoredStream};
 use crate::error::{Error, Result};
 
 /// Frames a second of a folder of images when nothing is said.
@@ -38,8 +44,10 @@ pub struct SourceInfo {
     pub frames_announced: Option<u64>,
     /// Frames a second, where the source announces them.
     pub frames_per_s: Option<f64>,
-    /// The files it is made of, in order.
+    /// The files it is made of, in order; empty for segments, which [`files`] lists at the end.
     pub files: Vec<PathBuf>,
+    /// More frames may come than there are now: the robot is still walking.
+    pub still_open: bool,
 }
 
 /// A run's images in order.
@@ -54,7 +62,7 @@ pub trait Source: Send {
     fn warnings(&self) -> Vec<String>;
 }
 
-/// Opens a video file or a folder of images. `name` names it in messages; `fps` is for folders.
+/// Opens a video file, a folder of images, or a run's segments (waiting for the first). `name` names it in messages; `fps` is for folders.
 ///
 /// # Errors
 /// [`Error::Input`] where it is neither, is empty, cannot be decoded or has sides outside 16 to
@@ -71,11 +79,42 @@ pub fn open(path: &Path, name: &str, fps: Option<f64>) -> Result<Box<dyn Source>
         }
         _ => Error::io(path, e),
     })?;
+    if let Some(segments) = segments::SegmentFolder::recognise(path, name)? {
+        return Ok(match segments.kind {
+            SegmentKind::Frames => Box::new(StoredFrames::open(Records::of_folder(segments), Vec::new())?),
+            SegmentKind::TransportStream => Box::new(StoredStream::open(segments)?),
+        });
+    }
+    if is_frame_file(path)? {
+        return Ok(Box::new(StoredFrames::open(Records::of_file(path, name), vec![path.to_path_buf()])?));
+    }
     if metadata.is_dir() {
         Ok(Box::new(folder::Folder::open(path, name, fps.unwrap_or(DEFAULT_FOLDER_FPS))?))
     } else {
         Ok(Box::new(video::VideoFile::open(path, name)?))
     }
+}
+
+/// The files of a source that has been read to its end, in order; `info` is what it said of itself.
+///
+/// # Errors
+/// Where a folder of segments cannot be listed.
+pub fn files(path: &Path, name: &str, info: &SourceInfo) -> Result<Vec<PathBuf>> {
+    match segments::SegmentFolder::recognise(path, name)? {
+        Some(segments) => segments.files(),
+        None => Ok(info.files.clone()),
+    }
+}
+
+/// Whether a file is one of stored frames.
+fn is_frame_file(path: &Path) -> Result<bool> {
+    if path.is_dir() {
+        return Ok(false);
+    }
+    let mut head = Vec::new();
+    let file = std::fs::File::open(path).map_err(|e| Error::io(path, e))?;
+    file.take(frame_file::MAGIC.len() as u64).read_to_end(&mut head).map_err(|e| Error::io(path, e))?;
+    Ok(head == frame_file::MAGIC)
 }
 
 /// FFmpeg is set up once; its own messages stay off the screen, since ours say more.

@@ -41,6 +41,7 @@ fn run_info(frames: Option<u64>, fps: f64) -> RecordedRun<'static> {
         recorded_at: "2026-03-01T10:00:00Z".parse().expect("a time"),
         frames_expected: frames,
         duration_expected_s: frames.map(|n| n as f64 / fps),
+        watched: false,
     }
 }
 

@@ -23,7 +23,7 @@ use crate::export::{depth_png, depth_tif, texture};
 use crate::motion::track::TrackUse;
 use crate::recording::{FrameSteps, RecordedRun, Recorder, Segment};
 use crate::rig::{LineDirection, Rig};
-use crate::source::{SourceInfo, encoded_frames};
+use crate::source::{self, SourceInfo, encoded_frames};
 use crate::surface::{Placed, SurfacePoint};
 
 /// Where live recording segments lie in the product folder; they are no products.
@@ -59,6 +59,7 @@ impl<'a> Products<'a> {
             recorded_at: request.recorded_at,
             frames_expected: info.frames_announced,
             duration_expected_s: info.frames_announced.zip(info.frames_per_s).map(|(n, fps)| n as f64 / fps),
+            watched: info.still_open,
         };
         let segments = request.live_segments.then(|| folder.join(SEGMENTS));
         let recorder =
@@ -460,7 +461,8 @@ fn trajectory_row(placed: &Placed<Cargo>) -> TrajectoryRow {
 }
 
 fn hash_source(info: &SourceInfo, request: &Request) -> Result<Vec<FileEntry>> {
-    let single = info.files.len() == 1;
+    let files = source::files(&request.source, &request.source_name, info)?;
+    let single = files.len() == 1;
     let name = |path: &Path| match path.file_name() {
         Some(file) if !single => file.to_string_lossy().into_owned(),
         _ => request.source_name.clone(),
@@ -469,7 +471,7 @@ fn hash_source(info: &SourceInfo, request: &Request) -> Result<Vec<FileEntry>> {
         let name = file.file_name().map_or_else(|| "poses".into(), |name| name.to_string_lossy().into_owned());
         FileEntry::of(file, name)
     });
-    info.files.iter().map(|file| FileEntry::of(file, name(file))).chain(poses).collect()
+    files.iter().map(|file| FileEntry::of(file, name(file))).chain(poses).collect()
 }
 
 /// Says in words what the figures mean for a person.

@@ -1,5 +1,6 @@
 //! The frames of a source as they are stored, not decoded: what the archive keeps.
 
+use std::os::fd::AsRawFd;
 use std::path::{Path, PathBuf};
 
 use ffmpeg_the_third as ffmpeg;
@@ -7,8 +8,10 @@ use ffmpeg_the_third as ffmpeg;
 use ffmpeg::codec::Id;
 
 use super::folder::image_files;
-use super::video::{display_name, open_container};
-use super::{DEFAULT_FOLDER_FPS, EncodedFormat, EncodedFrame};
+use super::frame_file::still_format;
+use super::segments::{Records, SegmentFolder, SegmentKind, StreamPart};
+use super::video::{display_name, open_container, open_pipe};
+use super::{DEFAULT_FOLDER_FPS, EncodedFormat, EncodedFrame, is_frame_file};
 use crate::error::{Error, Result};
 
 /// The frames of a source as stored, in decoding order.
@@ -20,6 +23,8 @@ pub struct EncodedFrames {
 enum Kind {
     Video(Box<VideoPackets>),
     Folder { files: Vec<PathBuf>, next: usize, fps: f64 },
+    Records { records: Records, first_time_ns: Option<i64> },
+    Parts(StreamParts),
 }
 
 struct VideoPackets {
@@ -37,10 +42,17 @@ struct VideoPackets {
 /// # Errors
 /// [`Error::Input`] where it cannot be opened, or is in a codec that archives have no schema for.
 pub fn encoded_frames(path: &Path, name: &str, fps: Option<f64>) -> Result<EncodedFrames> {
-    let kind = if path.is_dir() {
+    let kind = if let Some(segments) = SegmentFolder::recognise(path, name)? {
+        match segments.kind {
+            SegmentKind::Frames => Kind::Records { records: Records::of_folder(segments), first_time_ns: None },
+            SegmentKind::TransportStream => Kind::Parts(StreamParts::new(segments, name)),
+        }
+    } else if is_frame_file(path)? {
+        Kind::Records { records: Records::of_file(path, name), first_time_ns: None }
+    } else if path.is_dir() {
         Kind::Folder { files: image_files(path, name)?, next: 0, fps: fps.unwrap_or(DEFAULT_FOLDER_FPS) }
     } else {
-        Kind::Video(Box::new(VideoPackets::open(path, name)?))
+        Kind::Video(Box::new(VideoPackets::of_input(open_container(path, name)?, name)?))
     };
     Ok(EncodedFrames { name: name.to_string(), kind })
 }
@@ -51,6 +63,8 @@ impl Iterator for EncodedFrames {
     fn next(&mut self) -> Option<Self::Item> {
         match &mut self.kind {
             Kind::Video(packets) => packets.next().map(Ok),
+            Kind::Records { records, first_time_ns } => next_stored(records, first_time_ns).transpose(),
+            Kind::Parts(parts) => parts.next().transpose(),
             Kind::Folder { files, next, fps } => {
                 let file = files.get(*next)?;
                 let index = *next;
@@ -61,26 +75,70 @@ impl Iterator for EncodedFrames {
     }
 }
 
+/// The next stored image of a known format; what was no image was left out of the frames as well.
+fn next_stored(records: &mut Records, first_time_ns: &mut Option<i64>) -> Result<Option<EncodedFrame>> {
+    while let Some(record) = records.next_record()? {
+        let Some(format) = still_format(&record.image) else { continue };
+        let first_ns = *first_time_ns.get_or_insert(record.capture_time_ns);
+        let time_s = (record.capture_time_ns.saturating_sub(first_ns) as f64 / 1e9).max(0.0);
+        return Ok(Some(EncodedFrame { time_s, format, key: true, data: record.image }));
+    }
+    Ok(None)
+}
+
+/// The packets of a transport stream in segments, one uninterrupted part after the other.
+struct StreamParts {
+    name: String,
+    /// Where the next part begins.
+    rest: Option<SegmentFolder>,
+    open: Option<(VideoPackets, StreamPart, f64)>,
+    first_arrival_ns: Option<i64>,
+}
+
+impl StreamParts {
+    fn new(folder: SegmentFolder, name: &str) -> StreamParts {
+        StreamParts { name: name.into(), rest: Some(folder), open: None, first_arrival_ns: None }
+    }
+
+    fn next(&mut self) -> Result<Option<EncodedFrame>> {
+        loop {
+            if let Some((packets, _, start_s)) = &mut self.open
+                && let Some(frame) = packets.next()
+            {
+                return Ok(Some(EncodedFrame { time_s: *start_s + frame.time_s, ..frame }));
+            }
+            if let Some((packets, part, _)) = self.open.take() {
+                drop(packets);
+                self.rest = Some(part.end()?);
+            }
+            let Some(folder) = self.rest.take() else { return Ok(None) };
+            let Some(part) = StreamPart::begin(folder)? else { return Ok(None) };
+            let input = open_pipe(part.reader.as_raw_fd(), &self.name);
+            match input.and_then(|input| VideoPackets::of_input(input, &self.name)) {
+                Ok(packets) => {
+                    let first_ns = self.first_arrival_ns.or(part.arrival_ns);
+                    self.first_arrival_ns = first_ns;
+                    let later_ns = part.arrival_ns.zip(first_ns).map_or(0, |(now, first)| now.saturating_sub(first));
+                    self.open = Some((packets, part, (later_ns as f64 / 1e9).max(0.0)));
+                }
+                Err(Error::Input { .. }) => self.rest = Some(part.end()?),
+                Err(error) => return Err(error),
+            }
+        }
+    }
+}
+
 fn image_file(file: &Path, time_s: f64, name: &str) -> Result<EncodedFrame> {
     let data = std::fs::read(file).map_err(|e| Error::io(file, e))?;
-    let format = match data.get(..4) {
-        Some([0xff, 0xd8, ..]) => EncodedFormat::Jpeg,
-        Some([0x89, b'P', b'N', b'G']) => EncodedFormat::Png,
-        Some(b"RIFF") => EncodedFormat::Webp,
-        _ => {
-            return Err(Error::input(
-                format!("{name}/{}", display_name(file)),
-                "an image format archives cannot hold",
-                "JPEG, PNG or WebP",
-            ));
-        }
-    };
+    let format = still_format(&data).ok_or_else(|| {
+        let subject = format!("{name}/{}", display_name(file));
+        Error::input(subject, "an image format archives cannot hold", "JPEG, PNG or WebP")
+    })?;
     Ok(EncodedFrame { time_s, format, key: true, data })
 }
 
 impl VideoPackets {
-    fn open(path: &Path, name: &str) -> Result<VideoPackets> {
-        let input = open_container(path, name)?;
+    fn of_input(input: ffmpeg::format::context::Input, name: &str) -> Result<VideoPackets> {
         let stream = input
             .streams()
             .best(ffmpeg::media::Type::Video)

@@ -46,6 +46,7 @@ impl Folder {
             frames_announced: Some(files.len() as u64),
             frames_per_s: Some(fps),
             files,
+            still_open: false,
         };
         Ok(Folder { info, name: name.to_string(), fps, next: 0, skipped: Vec::new() })
     }

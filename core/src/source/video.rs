@@ -1,5 +1,6 @@
 //! A video file, or a single image, through FFmpeg.
 
+use std::os::fd::RawFd;
 use std::path::{Path, PathBuf};
 
 use ffmpeg_the_third as ffmpeg;
@@ -17,6 +18,9 @@ use crate::rig::MAX_IMAGE_SIDE_PX;
 /// addresses stay out: a hostile upload must not make the decoder open anything else.
 const CONTAINERS: &str = "mov,mp4,m4a,3gp,3g2,mj2,matroska,webm,avi,mpegts,mpeg,mpegvideo,h264,hevc,m4v,ivf,obu,flv,asf,\
 ogg,nut,mjpeg,mpjpeg,y4m,yuv4mpegpipe,image2,jpeg_pipe,png_pipe,webp_pipe,tiff_pipe,bmp_pipe,pgm_pipe,ppm_pipe,gif,apng";
+
+/// How much of a live stream is looked at before its frames are handed out, µs: people wait for them.
+const LIVE_PROBE_US: &str = "500000";
 
 /// Undecodable packets in a row after which the rest of the file is given up.
 const MAX_BAD_PACKETS_IN_A_ROW: u32 = 300;
@@ -57,9 +61,7 @@ pub(super) fn open_container(path: &Path, name: &str) -> Result<ffmpeg::format::
     if metadata.len() == 0 {
         return Err(Error::input(name, "an empty file (0 bytes)", "a video or an image"));
     }
-    let mut options = ffmpeg::Dictionary::new();
-    options.set("protocol_whitelist", "file");
-    options.set("format_whitelist", CONTAINERS);
+    let mut options = input_options("file", CONTAINERS);
     // An image's name is a name, not a pattern that could match other files.
     options.set("pattern_type", "none");
     // FFmpeg reads names with a colon as an address: always hand it a file's path.
@@ -79,6 +81,22 @@ pub(super) fn open_container(path: &Path, name: &str) -> Result<ffmpeg::format::
             "a video file that FFmpeg reads (MP4, MKV, AVI, MPEG-TS, …) or an image",
         )
     })
+}
+
+/// A transport stream from the reading end of a pipe.
+pub(super) fn open_pipe(descriptor: RawFd, name: &str) -> Result<ffmpeg::format::context::Input> {
+    super::init_ffmpeg();
+    let mut options = input_options("pipe", "mpegts");
+    options.set("analyzeduration", LIVE_PROBE_US);
+    ffmpeg::format::input_with_dictionary(format!("pipe:{descriptor}"), options)
+        .map_err(|e| Error::input(name, format!("not readable as MPEG-TS ({e})"), "an MPEG transport stream with video"))
+}
+
+fn input_options(protocols: &str, containers: &str) -> ffmpeg::Dictionary {
+    let mut options = ffmpeg::Dictionary::new();
+    options.set("protocol_whitelist", protocols);
+    options.set("format_whitelist", containers);
+    options
 }
 
 enum Head {
@@ -104,7 +122,11 @@ fn head_kind(path: &Path) -> Head {
 impl Video {
     /// Opens a file; `name` names it in errors.
     pub(super) fn open(path: &Path, name: &str) -> Result<Video> {
-        let input = open_container(path, name)?;
+        Video::of_input(open_container(path, name)?, name)
+    }
+
+    /// The video of an open container.
+    pub(super) fn of_input(input: ffmpeg::format::context::Input, name: &str) -> Result<Video> {
         let no_video = || Error::input(name, "no video stream", "a file with a video stream");
         let stream = input.streams().best(ffmpeg::media::Type::Video).ok_or_else(no_video)?;
         let parameters = stream.parameters();
@@ -156,7 +178,7 @@ impl Video {
     }
 
     /// What went wrong on the way, in words for people.
-    fn warnings(&self) -> Vec<String> {
+    pub(super) fn warnings(&self) -> Vec<String> {
         let mut warnings = Vec::new();
         if let Some(error) = &self.read_error {
             warnings.push(format!("{}: reading stopped early ({error}); what was read is processed", self.name));
@@ -196,7 +218,7 @@ impl Video {
 }
 
 /// The colours of a decoded frame.
-fn image(frame: ffmpeg::frame::Video) -> Result<Image> {
+pub(super) fn image(frame: ffmpeg::frame::Video) -> Result<Image> {
     let (width, height) = (frame.width() as usize, frame.height() as usize);
     if let Some((chroma_shift_x, chroma_shift_y)) = planar_shifts(frame.format()) {
         let format = YuvFormat {
@@ -254,6 +276,7 @@ impl VideoFile {
             frames_announced: video.frames_announced,
             frames_per_s: video.frames_per_s,
             files: vec![path.to_path_buf()],
+            still_open: false,
         };
         Ok(VideoFile { info, video, first_time_s: None, last_time_s: 0.0, next: 0, ended: false })
     }
@@ -296,7 +319,7 @@ impl Source for VideoFile {
     }
 }
 
-fn check_size(name: &str, width_px: u32, height_px: u32) -> Result<()> {
+pub(super) fn check_size(name: &str, width_px: u32, height_px: u32) -> Result<()> {
     let fits = |side: u32| (16..=MAX_IMAGE_SIDE_PX).contains(&side);
     if fits(width_px) && fits(height_px) {
         return Ok(());
