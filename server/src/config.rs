@@ -21,6 +21,10 @@ pub struct Config {
     pub workers: usize,
     /// Limits of requests.
     pub requests: RequestLimits,
+    /// Limits of uploads in pieces.
+    pub uploads: UploadLimits,
+    /// Limits of live streams.
+    pub live: LiveLimits,
     /// Limits of jobs.
     pub jobs: JobLimits,
 }
@@ -105,6 +109,80 @@ impl Default for RequestLimits {
             receiver_silence: Duration::from_secs(60),
             answer_timeout: Duration::from_secs(30),
             stop_grace: Duration::from_secs(5),
+        }
+    }
+}
+
+/// Limits of uploads that arrive in pieces (tus).
+#[derive(Clone, Debug)]
+pub struct UploadLimits {
+    /// Largest upload, bytes.
+    pub upload_bytes: u64,
+    /// Received bytes are made durable and promised after so many of them …
+    pub sync_bytes: u64,
+    /// … or after this time.
+    pub sync_every: Duration,
+    /// How long a request waits for the one before it to let go of an upload.
+    pub takeover: Duration,
+    /// An upload that nobody goes on with is kept this long.
+    pub kept_for: Duration,
+    /// That it expired is remembered this long.
+    pub remembered_for: Duration,
+}
+
+impl UploadLimits {
+    /// Bytes of a part on S3, so that the largest upload has no more parts than S3 takes.
+    pub fn part_bytes(&self) -> u64 {
+        const USUAL_BYTES: u64 = 8 << 20;
+        USUAL_BYTES.max(self.upload_bytes.div_ceil(u64::from(crate::store::PARTS_MAX)).next_multiple_of(1 << 20))
+    }
+}
+
+impl Default for UploadLimits {
+    fn default() -> Self {
+        UploadLimits {
+            upload_bytes: 64 * GB,
+            sync_bytes: 8 << 20,
+            sync_every: Duration::from_secs(1),
+            takeover: Duration::from_secs(3),
+            kept_for: Duration::from_secs(7 * 86_400),
+            remembered_for: Duration::from_secs(30 * 86_400),
+        }
+    }
+}
+
+/// Limits of live streams.
+#[derive(Clone, Debug)]
+pub struct LiveLimits {
+    /// Largest frame, bytes.
+    pub frame_bytes: usize,
+    /// Frames that a sender may be ahead of what is durable.
+    pub credit: u64,
+    /// A segment is closed after this time …
+    pub segment_time: Duration,
+    /// … or so many bytes.
+    pub segment_bytes: usize,
+    /// So often a sender hears what is durable while it sends.
+    pub ack_every: Duration,
+    /// A connection that brings nothing for this long is closed.
+    pub silence: Duration,
+    /// A robot that vanished has this long to come back before its run is closed.
+    pub come_back: Duration,
+    /// Live streams at the same time in one process.
+    pub streams_at_once: usize,
+}
+
+impl Default for LiveLimits {
+    fn default() -> Self {
+        LiveLimits {
+            frame_bytes: 32 << 20,
+            credit: 120,
+            segment_time: Duration::from_millis(200),
+            segment_bytes: 8 << 20,
+            ack_every: Duration::from_millis(250),
+            silence: Duration::from_secs(30),
+            come_back: Duration::from_secs(60),
+            streams_at_once: 16,
         }
     }
 }

@@ -27,8 +27,11 @@ pub use place::DatabasePlace;
 use crate::error::{Error, Result};
 
 /// The migrations in order; the schema's version is the number of those that ran.
-const MIGRATIONS: [&str; 2] =
-    [include_str!("migrations/0001_records.sql"), include_str!("migrations/0002_job_order.sql")];
+const MIGRATIONS: [&str; 3] = [
+    include_str!("migrations/0001_records.sql"),
+    include_str!("migrations/0002_job_order.sql"),
+    include_str!("migrations/0003_arrivals.sql"),
+];
 
 /// Connections kept open: readers do not wait for each other, nor for the writer.
 const MAX_CONNECTIONS: u32 = 8;

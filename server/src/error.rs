@@ -29,6 +29,15 @@ pub enum Error {
     /// The thing's present state does not allow it.
     #[error("{0}")]
     Conflict(String),
+    /// Somebody else is writing to it.
+    #[error("{0}")]
+    Locked(String),
+    /// It was there, and is no more.
+    #[error("{0}")]
+    Gone(String),
+    /// What arrived is not what was announced.
+    #[error("{0}")]
+    Checksum(String),
     /// An idempotency key came back with other content.
     #[error("the idempotency key '{0}' was already used with other content")]
     KeyReused(String),

@@ -21,6 +21,7 @@ mod rigs;
 mod runs;
 mod squeeze;
 mod stored;
+mod uploads;
 
 use std::sync::Arc;
 
@@ -40,6 +41,7 @@ use crate::error::Error;
 use crate::queue::Queue;
 use crate::runs::Runs;
 use crate::store::Store;
+use crate::uploads::Uploads;
 
 /// What every handler may use.
 #[derive(Clone)]
@@ -52,8 +54,10 @@ pub struct App {
     pub store: Store,
     /// Limits and folders.
     pub config: Arc<Config>,
+    /// Uploads in pieces.
+    pub uploads: Uploads,
     /// One permit per upload that may come in at the same time.
-    pub uploads: Arc<Semaphore>,
+    pub arrivals: Arc<Semaphore>,
     /// The server shall stop: streams end.
     pub stop: CancellationToken,
 }
@@ -73,6 +77,7 @@ struct Document;
 fn routes() -> OpenApiRouter<App> {
     OpenApiRouter::with_openapi(Document::openapi())
         .routes(routes!(runs::list_runs, ingest::create_run))
+        .merge(tus_routes())
         .routes(routes!(runs::get_run, runs::change_run, runs::delete_run))
         .routes(routes!(runs::get_source))
         .routes(routes!(runs::create_job))
@@ -99,6 +104,20 @@ fn routes() -> OpenApiRouter<App> {
         .routes(routes!(lists::list_workers))
         .routes(routes!(health::get_livez))
         .routes(routes!(health::get_readyz))
+}
+
+/// Uploads in pieces speak tus, in every answer.
+fn tus_routes() -> OpenApiRouter<App> {
+    OpenApiRouter::new()
+        .routes(routes!(uploads::create_upload, uploads::describe_uploads))
+        .routes(routes!(
+            uploads::get_upload,
+            uploads::send_piece,
+            uploads::send_piece_by_post,
+            uploads::delete_upload,
+            uploads::describe_upload
+        ))
+        .layer(middleware::from_fn(uploads::speak_tus))
 }
 
 /// The OpenAPI document, from the same list.

@@ -13,6 +13,7 @@ pub mod queue;
 pub mod retention;
 pub mod runs;
 pub mod store;
+pub mod uploads;
 pub mod wire;
 pub mod worker;
 

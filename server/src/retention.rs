@@ -11,6 +11,7 @@ use crate::db::tables::{idempotency_key, unpublished};
 use crate::error::Result;
 use crate::queue::Bell;
 use crate::store::Store;
+use crate::uploads::Uploads;
 use crate::wire::time::now_ms;
 
 /// How often to look when nobody rings.
@@ -23,10 +24,14 @@ const AT_ONCE: u64 = 100;
 const KEYS_KEPT_MS: i64 = 30 * 24 * 3_600_000;
 
 /// Looks again and again until asked to stop.
-pub async fn run(db: Db, store: Store, bell: Bell, stop: CancellationToken) {
+pub async fn run(db: Db, store: Store, uploads: Uploads, bell: Bell, stop: CancellationToken) {
     let mut changes = bell.listen();
     loop {
-        if let Err(error) = sweep(&db, &store).await {
+        let swept = async {
+            sweep(&db, &store).await?;
+            uploads.sweep().await
+        };
+        if let Err(error) = swept.await {
             tracing::warn!(%error, "cleaning up failed; it will be tried again");
         }
         let pause = async {

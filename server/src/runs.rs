@@ -8,6 +8,8 @@ mod rigs;
 use sea_orm::sea_query::OnConflict;
 use sea_orm::{ActiveValue::Set, ColumnTrait, ConnectionTrait, EntityTrait, QueryFilter, QuerySelect};
 
+use serde::{Deserialize, Serialize};
+
 pub use jobs::content_type;
 pub use listing::{Page, RunFilter, RunSort};
 pub use rigs::{RecipeText, RigText, built_in_recipes, options};
@@ -34,7 +36,7 @@ const UNRECORDED_MS: i64 = 3_600_000;
 const STOPPING_MS: i64 = 30_000;
 
 /// What is known about a run when it comes in.
-#[derive(Clone, Debug)]
+#[derive(Clone, Debug, Serialize, Deserialize)]
 pub struct NewRun {
     /// The pipe or wall.
     pub asset: String,
@@ -128,24 +130,55 @@ impl Runs {
     /// A whole upload becomes a run with one job. The file goes into the store first, under a key that is marked for
     /// deletion; the transaction that writes the records takes the mark away.
     pub async fn create(&self, new: NewRun, incoming: Incoming, key: Option<&str>) -> Result<Created<wire::Run>> {
+        let Incoming { file, facts } = &incoming;
+        let place = |source| async move {
+            self.store.take_file(file, &source, facts).await?;
+            self.store.sync().await
+        };
+        self.place_and_record(&Queue::new_id(), new, facts, key, place).await
+    }
+
+    /// As [`Runs::create`], for a file that `place` brings to its key, durably. The key makes it safe to repeat.
+    pub async fn publish<F>(
+        &self,
+        run: &str,
+        new: NewRun,
+        facts: &Facts,
+        key: &str,
+        place: impl FnOnce(Key) -> F,
+    ) -> Result<wire::Run>
+    where
+        F: Future<Output = Result<()>>,
+    {
+        Ok(self.place_and_record(run, new, facts, Some(key), place).await?.made)
+    }
+
+    async fn place_and_record<F>(
+        &self,
+        run: &str,
+        new: NewRun,
+        facts: &Facts,
+        key: Option<&str>,
+        place: impl FnOnce(Key) -> F,
+    ) -> Result<Created<wire::Run>>
+    where
+        F: Future<Output = Result<()>>,
+    {
         new.check()?;
-        let fingerprint = new.fingerprint(&incoming.facts);
+        let fingerprint = new.fingerprint(facts);
         if let Some(job) = self.made_before(self.db.read(), key, &fingerprint).await? {
             return Ok(Created { made: self.get(&job.run_id).await?, repeated: true });
         }
-        let run = Queue::new_id();
         let extension = store::plain_extension(&new.filename);
-        let prefix = store::run_prefix(&run);
+        let prefix = store::run_prefix(run);
         retried(ANSWER_PATIENCE, || self.mark_unrecorded(&prefix)).await?;
-        self.store.take_file(&incoming.file, &Key::source(&run, &extension), &incoming.facts).await?;
-        self.store.sync().await?;
+        place(Key::source(run, &extension)).await?;
 
-        let arrived =
-            Arrived { run: &run, extension: &extension, facts: &incoming.facts, key, fingerprint: &fingerprint };
+        let arrived = Arrived { run, extension: &extension, facts, key, fingerprint: &fingerprint };
         let repeats = retried(ANSWER_PATIENCE, || self.record(new.clone(), &arrived)).await?;
         self.queue.bell().ring();
         let repeated = repeats.is_some();
-        Ok(Created { made: self.get(&repeats.unwrap_or(run)).await?, repeated })
+        Ok(Created { made: self.get(repeats.as_deref().unwrap_or(run)).await?, repeated })
     }
 
     async fn mark_unrecorded(&self, prefix: &str) -> Result<()> {
@@ -187,6 +220,8 @@ impl Runs {
             rig_name: Set(new.rig.name.clone()),
             state: Set(JobState::Queued.as_str().into()),
             latest_job: Set(String::new()),
+            source_kind: Set("file".into()),
+            source_open: Set(0),
         };
         run::Entity::insert(row).exec_without_returning(&*t).await?;
         let job = NewJob {

@@ -167,6 +167,14 @@ impl Store {
         }
     }
 
+    /// Deletes one file; one that is gone already is no error.
+    pub async fn delete(&self, key: &Key) -> Result<()> {
+        match self.objects.delete(&self.path(key)).await {
+            Ok(()) | Err(object_store::Error::NotFound { .. }) => Ok(()),
+            Err(e) => Err(e.into()),
+        }
+    }
+
     /// Deletes everything under a prefix that this module made.
     pub async fn delete_prefix(&self, prefix: &str) -> Result<()> {
         let listed: Vec<_> = self.objects.list(Some(&self.prefixed(prefix))).try_collect().await?;

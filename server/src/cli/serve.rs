@@ -11,10 +11,11 @@ use tokio_util::sync::CancellationToken;
 
 use super::engine::{Engine, JobArgs, PlaceArgs, StopSignals, block_on, log_to_stderr, positive, slots};
 use super::{Failed, Outcome, Success};
-use crate::config::{Config, GB, RequestLimits};
+use crate::config::{Config, GB, LiveLimits, RequestLimits, UploadLimits};
 use crate::error::Error;
 use crate::http::{self, App};
 use crate::runs::Runs;
+use crate::uploads::Uploads;
 use crate::{incoming, retention};
 
 /// Run the service: runs come in over HTTP, jobs process them, staff look at the results in a browser
@@ -68,6 +69,8 @@ impl Serve {
             places: self.places.places(&self.data)?,
             workers: slots("--workers", self.workers)?,
             requests: RequestLimits { upload_bytes, ..RequestLimits::default() },
+            uploads: UploadLimits { upload_bytes, ..UploadLimits::default() },
+            live: LiveLimits::default(),
             jobs: self.jobs.limits()?,
         })
     }
@@ -85,17 +88,20 @@ async fn serve(config: Config) -> std::result::Result<(), Failed> {
     incoming::remove_leftovers(&config.places.incoming()).map_err(failed)?;
     let worker = engine.worker(&stop).map_err(failed)?;
     let (db, queue, store) = (engine.db.clone(), engine.queue.clone(), engine.store.clone());
+    let runs = Runs::new(db.clone(), queue.clone(), store.clone());
+    let uploads = Uploads::new(db.clone(), store.clone(), runs.clone(), config.uploads.clone());
     let app = App {
-        runs: Runs::new(db.clone(), queue.clone(), store.clone()),
+        runs,
+        uploads: uploads.clone(),
         queue: queue.clone(),
         store: store.clone(),
-        uploads: Arc::new(Semaphore::new(config.requests.uploads_at_once)),
+        arrivals: Arc::new(Semaphore::new(config.requests.uploads_at_once)),
         config: Arc::new(config.clone()),
         stop: stop.clone(),
     };
 
     let work = tokio::spawn(worker.run(config.workers));
-    let sweep = tokio::spawn(retention::run(db.clone(), store, queue.bell().clone(), stop.clone()));
+    let sweep = tokio::spawn(retention::run(db.clone(), store, uploads, queue.bell().clone(), stop.clone()));
     let requests = config.requests.clone();
     let answer = tokio::spawn(http::connection::serve(listener, http::router(app), requests, stop.clone()));
     println!("Stria is ready at http://{address}/");

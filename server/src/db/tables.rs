@@ -63,6 +63,8 @@ pub mod run {
         pub rig_name: String,
         pub state: String,
         pub latest_job: String,
+        pub source_kind: String,
+        pub source_open: i32,
     }
 
     #[derive(Copy, Clone, Debug, EnumIter, DeriveRelation)]
@@ -235,6 +237,113 @@ pub mod worker {
         pub slots: i32,
         pub started_ms: i64,
         pub seen_ms: i64,
+    }
+
+    #[derive(Copy, Clone, Debug, EnumIter, DeriveRelation)]
+    pub enum Relation {}
+
+    impl ActiveModelBehavior for ActiveModel {}
+}
+
+/// Uploads that are not a run yet.
+pub mod upload {
+    use sea_orm::entity::prelude::*;
+
+    #[derive(Clone, Debug, PartialEq, DeriveEntityModel)]
+    #[sea_orm(table_name = "uploads")]
+    pub struct Model {
+        #[sea_orm(primary_key, auto_increment = false)]
+        pub id: String,
+        pub created_ms: i64,
+        pub expires_ms: i64,
+        pub state: String,
+        pub idempotency_key: Option<String>,
+        pub fingerprint: String,
+        pub length_bytes: Option<i64>,
+        pub offset_bytes: i64,
+        pub metadata: String,
+        pub new_run: String,
+        pub sha256: Option<String>,
+        pub run_id: String,
+        pub job_id: Option<String>,
+        pub fence: i64,
+        pub hash_state: String,
+        pub part_bytes: i64,
+        pub parts_name: Option<String>,
+        pub tail_number: i64,
+        pub tail_bytes: i64,
+    }
+
+    #[derive(Copy, Clone, Debug, EnumIter, DeriveRelation)]
+    pub enum Relation {}
+
+    impl ActiveModelBehavior for ActiveModel {}
+}
+
+/// The parts of uploads on S3.
+pub mod upload_part {
+    use sea_orm::entity::prelude::*;
+
+    #[derive(Clone, Debug, PartialEq, DeriveEntityModel)]
+    #[sea_orm(table_name = "upload_parts")]
+    pub struct Model {
+        #[sea_orm(primary_key, auto_increment = false)]
+        pub upload_id: String,
+        #[sea_orm(primary_key, auto_increment = false)]
+        pub number: i64,
+        pub part: String,
+    }
+
+    #[derive(Copy, Clone, Debug, EnumIter, DeriveRelation)]
+    pub enum Relation {}
+
+    impl ActiveModelBehavior for ActiveModel {}
+}
+
+/// The segments of runs that came live.
+pub mod source_segment {
+    use sea_orm::entity::prelude::*;
+
+    #[derive(Clone, Debug, PartialEq, DeriveEntityModel)]
+    #[sea_orm(table_name = "source_segments")]
+    pub struct Model {
+        #[sea_orm(primary_key, auto_increment = false)]
+        pub run_id: String,
+        #[sea_orm(primary_key, auto_increment = false)]
+        pub number: i64,
+        pub bytes: i64,
+        pub sha256: String,
+        pub frames: i64,
+        pub part_arrival_ns: Option<i64>,
+    }
+
+    #[derive(Copy, Clone, Debug, EnumIter, DeriveRelation)]
+    pub enum Relation {}
+
+    impl ActiveModelBehavior for ActiveModel {}
+}
+
+/// Live streams by name.
+pub mod stream {
+    use sea_orm::entity::prelude::*;
+
+    #[derive(Clone, Debug, PartialEq, DeriveEntityModel)]
+    #[sea_orm(table_name = "streams")]
+    pub struct Model {
+        #[sea_orm(primary_key, auto_increment = false)]
+        pub name: String,
+        pub run_id: String,
+        pub job_id: String,
+        pub kind: String,
+        pub is_open: i32,
+        pub fence: i64,
+        pub beat: i64,
+        pub next_seq: i64,
+        pub frames: i64,
+        pub segments: i64,
+        pub bytes: i64,
+        pub missing: String,
+        pub opened_ms: i64,
     }
 
     #[derive(Copy, Clone, Debug, EnumIter, DeriveRelation)]

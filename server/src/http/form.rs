@@ -160,16 +160,22 @@ impl Fields {
 
     /// All of it, checked against the file that came.
     pub(super) fn into_new_run(self, incoming: &Incoming) -> Result<NewRun> {
-        self.check_complete()?;
+        let (new, sha256) = self.into_announced_run()?;
         if incoming.facts.bytes == 0 {
             return Err(Error::field("file", "the file is empty (0 bytes)", "a video file"));
         }
-        if let Some(expected) = &self.sha256
-            && *expected != incoming.facts.sha256
-        {
-            let found = format!("the file arrived with the SHA-256 {}", incoming.facts.sha256);
-            return Err(Error::field("sha256", found, format!("{expected}, as announced; send it again")));
+        match sha256 {
+            Some(expected) if expected != incoming.facts.sha256 => {
+                let found = format!("the file arrived with the SHA-256 {}", incoming.facts.sha256);
+                Err(Error::field("sha256", found, format!("{expected}, as announced; send it again")))
+            }
+            _ => Ok(new),
         }
+    }
+
+    /// All of it before its file is here, and the SHA-256 that the file shall have.
+    pub(super) fn into_announced_run(self) -> Result<(NewRun, Option<String>)> {
+        self.check_complete()?;
         let (Some(asset), Some(rig)) = (self.asset, self.rig) else {
             return Err(Error::Internal("fields were checked but are missing".into()));
         };
@@ -185,7 +191,7 @@ impl Fields {
             fps: self.fps,
         };
         new.check()?;
-        Ok(new)
+        Ok((new, self.sha256))
     }
 }
 

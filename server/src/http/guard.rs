@@ -70,7 +70,9 @@ fn check_origin(headers: &HeaderMap) -> Result<(), Error> {
 
 /// Anything but an upload begins to answer within its time.
 pub(super) async fn answer_in_time(State(app): State<App>, request: Request, next: Next) -> Response {
-    let upload = request.method() == Method::POST && request.uri().path() == "/api/runs";
+    let path = request.uri().path();
+    let sends = matches!(*request.method(), Method::POST | Method::PATCH);
+    let upload = sends && (path == "/api/runs" || path.starts_with("/api/uploads") || path.starts_with("/api/live/"));
     if upload {
         return next.run(request).await;
     }

@@ -18,8 +18,15 @@ pub(super) enum Refusal {
     MediaType { found: String, expected: &'static str },
     /// The asked range lies outside the file.
     Range { asked: String, bytes: u64 },
+    /// The protocol's version is another.
+    Version { found: String, expected: &'static str },
     /// The answer did not begin in time.
     TooSlow,
+}
+
+/// What tus 1.0.0 answers to a wrong checksum.
+fn checksum_mismatch() -> StatusCode {
+    StatusCode::from_u16(460).unwrap_or(StatusCode::BAD_REQUEST)
 }
 
 impl IntoResponse for Error {
@@ -46,6 +53,13 @@ impl IntoResponse for Error {
             }
             Error::Conflict(_) => {
                 answer(StatusCode::CONFLICT, "conflict", "Its present state does not allow it", detail, false)
+            }
+            Error::Locked(_) => {
+                answer(StatusCode::LOCKED, "locked", "Another request is writing to it", detail, true)
+            }
+            Error::Gone(_) => answer(StatusCode::GONE, "gone", "It is no more", detail, false),
+            Error::Checksum(_) => {
+                answer(checksum_mismatch(), "checksum-mismatch", "Not what was announced", detail, true)
             }
             Error::KeyReused(_) => {
                 let title = "The idempotency key belongs to another request";
@@ -102,6 +116,12 @@ impl IntoResponse for Refusal {
                     response.headers_mut().insert(axum::http::header::CONTENT_RANGE, value);
                 }
                 response
+            }
+            Refusal::Version { found, expected } => {
+                let status = StatusCode::PRECONDITION_FAILED;
+                let mut problem = problem(status, "wrong-version", "The protocol's version does not fit", found, false);
+                problem.expected = Some(expected.into());
+                send(status, &problem)
             }
             Refusal::TooSlow => {
                 let detail = "the server did not answer in time".into();

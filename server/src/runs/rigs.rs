@@ -1,5 +1,6 @@
 //! Rigs and recipes: as text in a request, as stored rows, as built-in names.
 
+use serde::{Deserialize, Serialize};
 use sea_orm::sea_query::OnConflict;
 use sea_orm::{ActiveValue::Set, ColumnTrait, ConnectionTrait, EntityTrait, QueryFilter, QueryOrder, QuerySelect};
 use stria_core::recipe::{self, Recipe};
@@ -17,7 +18,7 @@ use crate::wire::{self, OptionRange};
 const CUSTOM: &str = "custom";
 
 /// A rig that was checked, as a job keeps it.
-#[derive(Clone, Debug, PartialEq)]
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 pub struct RigText {
     /// Its name.
     pub name: String,
@@ -37,7 +38,7 @@ impl RigText {
 }
 
 /// A recipe that was checked, as a job keeps it.
-#[derive(Clone, Debug, PartialEq)]
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 pub struct RecipeText {
     /// A built-in recipe's name, or `custom`.
     pub name: String,
