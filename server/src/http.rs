@@ -13,6 +13,7 @@ mod health;
 mod ingest;
 mod jobs;
 mod lists;
+mod live;
 mod measure;
 mod page;
 mod problem;
@@ -38,6 +39,7 @@ use utoipa_axum::routes;
 
 use crate::config::Config;
 use crate::error::Error;
+use crate::live::Live;
 use crate::queue::Queue;
 use crate::runs::Runs;
 use crate::store::Store;
@@ -56,6 +58,10 @@ pub struct App {
     pub config: Arc<Config>,
     /// Uploads in pieces.
     pub uploads: Uploads,
+    /// Live streams.
+    pub live: Live,
+    /// One permit per live stream that may be open at the same time.
+    pub streams: Arc<Semaphore>,
     /// One permit per upload that may come in at the same time.
     pub arrivals: Arc<Semaphore>,
     /// The server shall stop: streams end.
@@ -78,6 +84,8 @@ fn routes() -> OpenApiRouter<App> {
     OpenApiRouter::with_openapi(Document::openapi())
         .routes(routes!(runs::list_runs, ingest::create_run))
         .merge(tus_routes())
+        .routes(routes!(live::list_streams))
+        .routes(routes!(live::open_stream, live::post_stream))
         .routes(routes!(runs::get_run, runs::change_run, runs::delete_run))
         .routes(routes!(runs::get_source))
         .routes(routes!(runs::create_job))

@@ -68,6 +68,24 @@ impl Default for Bell {
     }
 }
 
+/// Which jobs a worker takes.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub enum Wanted {
+    /// Whichever goes next.
+    Any,
+    /// Of robots that walk now.
+    Live,
+}
+
+impl Wanted {
+    fn condition(self) -> Condition {
+        match self {
+            Wanted::Any => Condition::all(),
+            Wanted::Live => Condition::all().add(job::Column::Priority.eq(Priority::Live.as_str())),
+        }
+    }
+}
+
 /// A job to be.
 pub struct NewJob {
     /// The run.
@@ -154,18 +172,18 @@ impl Queue {
         Ok(id)
     }
 
-    /// Takes the next job, if there is one: counts the attempt, raises the fence, clears what an earlier attempt left.
-    pub async fn claim(&self, node: &str, worker: &str) -> Result<Option<Lease>> {
+    /// Takes the next job of a kind, if there is one: counts the attempt, raises the fence, clears what an earlier attempt left.
+    pub async fn claim(&self, which: Wanted, node: &str, worker: &str) -> Result<Option<Lease>> {
         // Looking first keeps idle workers from taking the write lock again and again.
-        if self.next_ready(self.db.read(), false).await?.is_none() {
+        if self.next_ready(which, self.db.read(), false).await?.is_none() {
             return Ok(None);
         }
-        retried(ANSWER_PATIENCE, || self.try_claim(node, worker)).await
+        retried(ANSWER_PATIENCE, || self.try_claim(which, node, worker)).await
     }
 
-    async fn try_claim(&self, node: &str, worker: &str) -> Result<Option<Lease>> {
+    async fn try_claim(&self, which: Wanted, node: &str, worker: &str) -> Result<Option<Lease>> {
         let t = self.db.write().await?;
-        let Some(next) = self.next_ready(&*t, true).await? else { return Ok(None) };
+        let Some(next) = self.next_ready(which, &*t, true).await? else { return Ok(None) };
         let Some(run) = run::Entity::find_by_id(&next.run_id).one(&*t).await? else {
             return Err(Error::Internal(format!("job {} has no run", next.id)));
         };
@@ -203,7 +221,12 @@ impl Queue {
     }
 
     /// The queued job that goes next.
-    async fn next_ready(&self, records: &impl ConnectionTrait, to_take: bool) -> Result<Option<job::Model>> {
+    async fn next_ready(
+        &self,
+        which: Wanted,
+        records: &impl ConnectionTrait,
+        to_take: bool,
+    ) -> Result<Option<job::Model>> {
         let now = now_ms();
         // A wait further off than any that we set means that the clock was set back: it must not park a job.
         let horizon = now + 2 * self.limits.retry_max.as_millis() as i64;
@@ -211,6 +234,7 @@ impl Queue {
         let mut query = job::Entity::find()
             .filter(job::Column::State.eq(JobState::Queued.as_str()))
             .filter(ready)
+            .filter(which.condition())
             .order_by_asc(job::Column::RankMs)
             .order_by_asc(job::Column::Id);
         if to_take {

@@ -19,6 +19,7 @@ use crate::db::{ANSWER_PATIENCE, Db, retried};
 use crate::error::{Error, Result};
 use crate::incoming::Incoming;
 use crate::queue::{self, NewJob, Queue};
+use crate::source;
 use crate::store::{self, Facts, Key, Store};
 use crate::wire::time::{from_text, now_ms, to_text};
 use crate::wire::{self, Direction, JobState, Priority, RunChange};
@@ -98,11 +99,28 @@ pub struct Created<T> {
     pub repeated: bool,
 }
 
+/// Most segments of a run: weeks of a live stream.
+const MAX_SEGMENTS: u64 = 10_000_000;
+
+/// How a run's images are kept.
+pub struct SourceRecord<'a> {
+    /// [`source::FILE`], or what its segments hold.
+    pub kind: &'a str,
+    /// The extension of its files.
+    pub extension: &'a str,
+    /// Size so far, bytes.
+    pub bytes: u64,
+    /// SHA-256 of all of it in lower-case hex; empty while it is open.
+    pub sha256: &'a str,
+    /// The robot may still send.
+    pub open: bool,
+}
+
 /// A run's images, to be sent back.
 pub struct SourceFile {
-    /// Where they lie.
-    pub key: Key,
-    /// Size and hash.
+    /// Where they lie, in order, each with its size in bytes.
+    pub parts: Vec<(Key, u64)>,
+    /// Size and hash of the whole.
     pub facts: Facts,
     /// The file's own name.
     pub filename: String,
@@ -201,11 +219,29 @@ impl Runs {
             }
             return Ok(Some(job.run_id));
         }
-        insert_asset(&*t, &new.asset).await?;
-        rigs::keep_if_new(&*t, &new.rig).await?;
+        let source =
+            SourceRecord { kind: source::FILE, extension, bytes: facts.bytes, sha256: &facts.sha256, open: false };
+        let job = self.insert(&*t, run, new, &source, Priority::Upload).await?;
+        remember(&*t, key, fingerprint, &job).await?;
+        unpublished::Entity::delete_by_id(prefix).exec(&*t).await?;
+        t.commit().await?;
+        Ok(None)
+    }
+
+    /// Writes a run and its first job inside the caller's transaction; the caller rings the bell after its commit.
+    pub async fn insert(
+        &self,
+        records: &impl ConnectionTrait,
+        id: &str,
+        new: NewRun,
+        source: &SourceRecord<'_>,
+        priority: Priority,
+    ) -> Result<String> {
+        insert_asset(records, &new.asset).await?;
+        rigs::keep_if_new(records, &new.rig).await?;
         let now = now_ms();
         let row = run::ActiveModel {
-            id: Set(run.into()),
+            id: Set(id.into()),
             created_ms: Set(now),
             asset: Set(new.asset),
             chainage_mm: Set(new.chainage_mm),
@@ -213,30 +249,26 @@ impl Runs {
             recorded_ms: Set(new.recorded_ms.unwrap_or(now)),
             note: Set(new.note),
             filename: Set(new.filename),
-            source_extension: Set(extension.into()),
-            source_bytes: Set(to_i64(facts.bytes)),
-            source_sha256: Set(facts.sha256.clone()),
+            source_extension: Set(source.extension.into()),
+            source_bytes: Set(to_i64(source.bytes)),
+            source_sha256: Set(source.sha256.into()),
             fps: Set(new.fps),
             rig_name: Set(new.rig.name.clone()),
             state: Set(JobState::Queued.as_str().into()),
             latest_job: Set(String::new()),
-            source_kind: Set("file".into()),
-            source_open: Set(0),
+            source_kind: Set(source.kind.into()),
+            source_open: Set(i32::from(source.open)),
         };
-        run::Entity::insert(row).exec_without_returning(&*t).await?;
+        run::Entity::insert(row).exec_without_returning(records).await?;
         let job = NewJob {
-            run: run.into(),
-            priority: Priority::Upload,
+            run: id.into(),
+            priority,
             rig_name: new.rig.name,
             rig_toml: new.rig.toml,
             recipe_name: new.recipe.name,
             recipe_toml: new.recipe.toml,
         };
-        let job = self.queue.enqueue(&*t, job).await?;
-        remember(&*t, key, fingerprint, &job).await?;
-        unpublished::Entity::delete_by_id(prefix).exec(&*t).await?;
-        t.commit().await?;
-        Ok(None)
+        self.queue.enqueue(records, job).await
     }
 
     /// Processes a run again: what is not said stays as in its latest job.
@@ -298,8 +330,17 @@ impl Runs {
     /// A run's images.
     pub async fn source(&self, id: &str) -> Result<SourceFile> {
         let row = self.row(self.db.read(), id).await?;
+        if row.source_open != 0 {
+            return Err(Error::Conflict("the robot still sends; ask again when the run has ended".into()));
+        }
         let facts = Facts { bytes: to_u64(row.source_bytes), sha256: row.source_sha256 };
-        Ok(SourceFile { key: Key::source(&row.id, &row.source_extension), facts, filename: row.filename })
+        if row.source_kind == source::FILE {
+            let parts = vec![(Key::source(&row.id, &row.source_extension), facts.bytes)];
+            return Ok(SourceFile { parts, facts, filename: row.filename });
+        }
+        let segments = source::segments(&self.db, id, &row.source_extension, 0, MAX_SEGMENTS).await?;
+        let parts = segments.into_iter().map(|segment| (segment.key, segment.facts.bytes)).collect();
+        Ok(SourceFile { parts, facts, filename: row.filename })
     }
 
     /// Changes what is said about a run.

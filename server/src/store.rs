@@ -123,6 +123,22 @@ impl Store {
         Ok(facts)
     }
 
+    /// Puts a small file and makes it survive the loss of power, without waiting for anything else that is written to
+    /// the same disk.
+    pub async fn put_durable(&self, key: &Key, bytes: Bytes) -> Result<Facts> {
+        let facts = Facts { bytes: bytes.len() as u64, sha256: hex(&Sha256::digest(&bytes)) };
+        match &self.place {
+            Place::Bucket { .. } => drop(self.objects.put(&self.path(key), bytes.into()).await?),
+            Place::Folder { files, .. } => {
+                let path = files.path_to_filesystem(&self.path(key))?;
+                let file = path.clone();
+                let written = blocking(move || write_durably(&file, &bytes)).await?;
+                written.map_err(|e| Error::io(path, e))?;
+            }
+        }
+        Ok(facts)
+    }
+
     /// A small file, of at most `most_bytes`.
     pub async fn get_bytes(&self, key: &Key, most_bytes: u64) -> Result<Bytes> {
         let got = self.objects.get(&self.path(key)).await?;
@@ -200,6 +216,17 @@ impl Store {
         }
         Ok(())
     }
+}
+
+/// Writes beside the name, syncs, renames, syncs the folder.
+fn write_durably(path: &Path, bytes: &[u8]) -> std::io::Result<()> {
+    let folder = path.parent().unwrap_or(path);
+    std::fs::create_dir_all(folder)?;
+    let mut file = tempfile::NamedTempFile::new_in(folder)?;
+    std::io::Write::write_all(&mut file, bytes)?;
+    file.as_file().sync_data()?;
+    file.persist(path)?;
+    std::fs::File::open(folder)?.sync_all()
 }
 
 /// Runs file work off the async threads; the outer error is a panic in it.

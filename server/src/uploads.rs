@@ -5,7 +5,6 @@
 //! and is waited for. Between servers the row's fence does the same: an older request's next write finds it changed.
 
 mod bytes_so_far;
-mod turn;
 
 use std::sync::Arc;
 use std::time::Duration;
@@ -15,7 +14,6 @@ use sea_orm::{ActiveValue::Set, ColumnTrait, Condition, EntityTrait, ExprTrait, 
 use tokio_util::sync::CancellationToken;
 
 use self::bytes_so_far::BytesSoFar;
-use self::turn::{Turn, Turns};
 use crate::config::UploadLimits;
 use crate::db::tables::{upload, upload_part};
 use crate::db::{ANSWER_PATIENCE, Db, retried};
@@ -23,6 +21,7 @@ use crate::error::{Error, Result};
 use crate::queue::Queue;
 use crate::runs::{NewRun, Runs};
 use crate::store::{Facts, Store, upload_prefix};
+use crate::turns::{Turn, Turns};
 use crate::wire::time::now_ms;
 
 /// Uploads of one sweep.
@@ -174,7 +173,8 @@ impl Uploads {
     }
 
     async fn row(&self, id: &str) -> Result<upload::Model> {
-        let found = retried(ANSWER_PATIENCE, || async { Ok(upload::Entity::find_by_id(id).one(self.db.read()).await?) });
+        let found =
+            retried(ANSWER_PATIENCE, || async { Ok(upload::Entity::find_by_id(id).one(self.db.read()).await?) });
         check_state(found.await?.ok_or_else(|| not_found(id))?)
     }
 
@@ -195,9 +195,8 @@ impl Uploads {
 
     /// Forgets uploads that nobody went on with, and ends those whose last request was cut off before its answer.
     pub async fn sweep(&self) -> Result<()> {
-        let old = Condition::all()
-            .add(upload::Column::State.ne(state::EXPIRED))
-            .add(upload::Column::ExpiresMs.lt(now_ms()));
+        let old =
+            Condition::all().add(upload::Column::State.ne(state::EXPIRED)).add(upload::Column::ExpiresMs.lt(now_ms()));
         let rows = upload::Entity::find().filter(old).limit(SWEPT_AT_ONCE).all(self.db.read()).await?;
         for row in rows {
             let (done, id) = (row.state == state::DONE, row.id.clone());
@@ -219,9 +218,8 @@ impl Uploads {
         }
         let forgotten = now_ms() - i64::try_from(self.limits.remembered_for.as_millis()).unwrap_or(i64::MAX / 2);
         let t = self.db.write().await?;
-        let ended = Condition::all()
-            .add(upload::Column::State.eq(state::EXPIRED))
-            .add(upload::Column::ExpiresMs.lt(forgotten));
+        let ended =
+            Condition::all().add(upload::Column::State.eq(state::EXPIRED)).add(upload::Column::ExpiresMs.lt(forgotten));
         upload::Entity::delete_many().filter(ended).exec(&*t).await?;
         t.commit().await
     }
@@ -317,10 +315,8 @@ impl Held {
         if self.row.length_bytes != Some(self.row.offset_bytes) {
             return Ok(None);
         }
-        let facts = Facts {
-            bytes: to_u64(self.row.offset_bytes),
-            sha256: bytes_so_far::sha256_of_state(&self.row.hash_state)?,
-        };
+        let facts =
+            Facts { bytes: to_u64(self.row.offset_bytes), sha256: crate::resumed_hash::finish(&self.row.hash_state)? };
         if let Some(expected) = self.row.sha256.clone().filter(|expected| *expected != facts.sha256) {
             let spoiled = upload::ActiveModel { state: Set(state::SPOILED.into()), ..Default::default() };
             self.write(spoiled, &[]).await?;

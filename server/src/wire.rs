@@ -5,6 +5,7 @@
 pub mod child;
 mod job;
 mod lists;
+mod live;
 mod measure;
 mod run;
 pub mod time;
@@ -14,6 +15,7 @@ pub use lists::{
     Asset, AssetPage, Health, JobPage, LogPage, OptionRange, ProductPage, Recipe, RecipeOption, Rig, RigPage, RunPage,
     Worker,
 };
+pub use live::{LiveEnded, LiveStream, LiveStreams};
 pub use measure::{CrossSection, Trajectory};
 pub use run::{Direction, Run, RunChange, RunSource};
 

@@ -5,6 +5,7 @@
 
 mod attempt;
 mod child;
+mod follow;
 mod publish;
 mod scratch;
 mod showcase;
@@ -20,7 +21,7 @@ use crate::config::JobLimits;
 use crate::db::tables::worker;
 use crate::db::{ANSWER_PATIENCE, Db, retried};
 use crate::error::Result;
-use crate::queue::{LeaseWatch, Queue};
+use crate::queue::{LeaseWatch, Queue, Wanted};
 use crate::store::Store;
 use crate::wire::time::now_ms;
 
@@ -67,7 +68,11 @@ impl Worker {
         retried(ANSWER_PATIENCE, || self.announce(slots)).await?;
         let mut tasks = JoinSet::new();
         for _ in 0..slots {
-            tasks.spawn(self.clone().work());
+            tasks.spawn(self.clone().work(Wanted::Any));
+        }
+        if slots > 0 {
+            // People watch a live run: it never waits for a long one to end.
+            tasks.spawn(self.clone().work(Wanted::Live));
         }
         tasks.spawn(self.clone().watch_leases());
         tasks.spawn(self.clone().stay_listed());
@@ -86,11 +91,11 @@ impl Worker {
     }
 
     /// One job after the other.
-    async fn work(self) {
+    async fn work(self, which: Wanted) {
         let mut changes = self.queue.bell().listen();
         while !self.stop.is_cancelled() {
             changes.borrow_and_update();
-            match self.queue.claim(&self.node, &self.name).await {
+            match self.queue.claim(which, &self.node, &self.name).await {
                 Ok(Some(lease)) => {
                     attempt::run(&self, &lease).await;
                     continue;

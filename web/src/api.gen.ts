@@ -284,6 +284,54 @@ export interface paths {
         patch?: never;
         trace?: never;
     };
+    "/api/live": {
+        parameters: {
+            query?: never;
+            header?: never;
+            path?: never;
+            cookie?: never;
+        };
+        /** The live streams, the latest first. */
+        get: operations["list_streams"];
+        put?: never;
+        post?: never;
+        delete?: never;
+        options?: never;
+        head?: never;
+        patch?: never;
+        trace?: never;
+    };
+    "/api/live/{stream}": {
+        parameters: {
+            query?: never;
+            header?: never;
+            path?: never;
+            cookie?: never;
+        };
+        /**
+         * Frames of a robot that walks now, by WebSocket.
+         * @description Text messages are JSON, binary ones frames: sequence number (u64), capture time in ns since 1970 (i64), CRC-32C of the
+         *     image (u32), the image (JPEG, PNG or WebP), little endian. The client begins with `hello` (`asset`, `rig`, `recipe`,
+         *     `fps`, `chainage_mm`, `direction`, `note`, `resume`), is told `welcome` (`run`, `job`, `next_seq`, `credit`), sends frames
+         *     from `next_seq` on, at most `credit` ahead of the last `ack` (`durable_seq`, `credit`), and ends with `end`, answered by
+         *     `closed` (`frames`, `missing`). An `error` (`title`, `detail`, `retryable`) comes before the connection is closed.
+         */
+        get: operations["open_stream"];
+        put?: never;
+        /**
+         * Frames of a robot that walks now, as the body of one request.
+         * @description MJPEG (multipart with any boundary, or bare images one after the other) or MPEG-TS (H.264, H.265), told apart by their
+         *     bytes. The run's fields are query parameters. A part's `X-Timestamp` (s since 1970) and `X-Seq` are honoured; without
+         *     them a frame counts from its arrival. A body that ends closes the run; a connection that breaks leaves it open for a
+         *     while, and the next request of the stream goes on with it (unless `resume=false`).
+         */
+        post: operations["post_stream"];
+        delete?: never;
+        options?: never;
+        head?: never;
+        patch?: never;
+        trace?: never;
+    };
     "/api/options": {
         parameters: {
             query?: never;
@@ -427,6 +475,54 @@ export interface paths {
         options?: never;
         head?: never;
         patch?: never;
+        trace?: never;
+    };
+    "/api/uploads": {
+        parameters: {
+            query?: never;
+            header?: never;
+            path?: never;
+            cookie?: never;
+        };
+        get?: never;
+        put?: never;
+        /**
+         * Begin an upload in pieces (tus 1.0.0).
+         * @description `Upload-Metadata` carries the run's fields, base64 each: `filename`, `asset`, `rig` (a stored rig's name, or a rig
+         *     file), `recipe`, `chainage_mm`, `direction`, `recorded_at`, `fps`, `note`, `sha256` of the whole file. They are
+         *     checked now, before any byte is sent. The body may be the first piece.
+         */
+        post: operations["create_upload"];
+        delete?: never;
+        /** What this server speaks. */
+        options: operations["describe_uploads"];
+        head?: never;
+        patch?: never;
+        trace?: never;
+    };
+    "/api/uploads/{upload}": {
+        parameters: {
+            query?: never;
+            header?: never;
+            path?: never;
+            cookie?: never;
+        };
+        get?: never;
+        put?: never;
+        /** A request of a client that can only POST: `X-HTTP-Method-Override` names the method that it means. */
+        post: operations["send_piece_by_post"];
+        /** Give an upload up. A run that it became stays. */
+        delete: operations["delete_upload"];
+        /** What this server speaks, asked at an upload. */
+        options: operations["describe_upload"];
+        /** How far an upload is. A request that is still writing to it is stopped first, so that the offset is final. */
+        head: operations["get_upload"];
+        /**
+         * Send the next piece of an upload.
+         * @description What arrives is kept, also when the connection is cut (but for a piece with a checksum, which counts as a whole). The
+         *     piece that completes the file makes the run and its job: `Stria-Run` and `Stria-Job` name them.
+         */
+        patch: operations["send_piece"];
         trace?: never;
     };
     "/api/workers": {
@@ -614,6 +710,52 @@ export interface components {
          * @enum {string}
          */
         JobState: "queued" | "running" | "done" | "failed" | "cancelled";
+        /** @description What a POST brought. */
+        LiveEnded: {
+            /**
+             * Format: int64
+             * @description Images received; 0 for MPEG-TS.
+             */
+            frames: number;
+            /** @description Its job. */
+            job: string;
+            /** @description Frames that were never sent: first and last number of each range. */
+            missing: number[][];
+            /** @description The run. */
+            run: string;
+        };
+        /** @description A live stream. */
+        LiveStream: {
+            /**
+             * Format: int64
+             * @description Bytes received.
+             */
+            bytes: number;
+            /**
+             * Format: int64
+             * @description Images received; 0 for MPEG-TS, whose frames are counted when they are decoded.
+             */
+            frames: number;
+            /** @description That run's first job. */
+            job: string;
+            /** @description What it brings: `frames` (images) or `ts` (MPEG-TS). */
+            kind: string;
+            /** @description Frames that were never sent: first and last number of each range. */
+            missing: number[][];
+            /** @description The robot may still send. */
+            open: boolean;
+            /** @description When the run was opened (RFC 3339, UTC). */
+            opened_at: string;
+            /** @description Its latest run. */
+            run: string;
+            /** @description Its name. */
+            stream: string;
+        };
+        /** @description The live streams. */
+        LiveStreams: {
+            /** @description The latest first. */
+            items: components["schemas"]["LiveStream"][];
+        };
         /** @description A line of a job's log. */
         LogLine: {
             /** @description When. */
@@ -844,7 +986,7 @@ export interface components {
         RunSource: {
             /**
              * Format: int64
-             * @description Size, bytes.
+             * @description Size, bytes; so far, while it is open.
              */
             bytes: number;
             /** @description The file's own name, as its sender gave it. */
@@ -854,8 +996,10 @@ export interface components {
              * @description Frames a second, where the sender said so.
              */
             fps?: number | null;
-            /** @description SHA-256 in lower-case hex. */
-            sha256: string;
+            /** @description The robot still sends: there will be more. */
+            open: boolean;
+            /** @description SHA-256 in lower-case hex; not known while it is open. */
+            sha256?: string | null;
             /** @description Where to get it back, byte for byte. */
             url: string;
         };
@@ -1534,6 +1678,139 @@ export interface operations {
             };
         };
     };
+    list_streams: {
+        parameters: {
+            query?: never;
+            header?: never;
+            path?: never;
+            cookie?: never;
+        };
+        requestBody?: never;
+        responses: {
+            200: {
+                headers: {
+                    [name: string]: unknown;
+                };
+                content: {
+                    "application/json": components["schemas"]["LiveStreams"];
+                };
+            };
+        };
+    };
+    open_stream: {
+        parameters: {
+            query?: never;
+            header?: never;
+            path: {
+                /** @description The stream's name, such as the robot's */
+                stream: string;
+            };
+            cookie?: never;
+        };
+        requestBody?: never;
+        responses: {
+            /** @description A WebSocket */
+            101: {
+                headers: {
+                    [name: string]: unknown;
+                };
+                content?: never;
+            };
+            400: {
+                headers: {
+                    [name: string]: unknown;
+                };
+                content: {
+                    "application/problem+json": components["schemas"]["Problem"];
+                };
+            };
+        };
+    };
+    post_stream: {
+        parameters: {
+            query: {
+                /** @description The pipe or wall */
+                asset: string;
+                /** @description A stored rig's name, or a rig file */
+                rig: string;
+                /** @description A built-in recipe's name, or TOML */
+                recipe?: string;
+                /** @description Chainage of the first frame, mm */
+                chainage_mm?: number;
+                /** @description forward (default) or backward */
+                direction?: string;
+                /** @description RFC 3339; when absent, the first frame's time */
+                recorded_at?: string;
+                /** @description Words for people */
+                note?: string;
+                /** @description Go on with an open run; true when absent */
+                resume?: boolean;
+            };
+            header?: never;
+            path: {
+                /** @description The stream's name, such as the robot's */
+                stream: string;
+            };
+            cookie?: never;
+        };
+        requestBody: {
+            content: {
+                "image/jpeg": number[];
+                "multipart/x-mixed-replace": number[];
+                "video/mp2t": number[];
+            };
+        };
+        responses: {
+            200: {
+                headers: {
+                    [name: string]: unknown;
+                };
+                content: {
+                    "application/json": components["schemas"]["LiveEnded"];
+                };
+            };
+            400: {
+                headers: {
+                    [name: string]: unknown;
+                };
+                content: {
+                    "application/problem+json": components["schemas"]["Problem"];
+                };
+            };
+            408: {
+                headers: {
+                    [name: string]: unknown;
+                };
+                content: {
+                    "application/problem+json": components["schemas"]["Problem"];
+                };
+            };
+            423: {
+                headers: {
+                    [name: string]: unknown;
+                };
+                content: {
+                    "application/problem+json": components["schemas"]["Problem"];
+                };
+            };
+            503: {
+                headers: {
+                    [name: string]: unknown;
+                };
+                content: {
+                    "application/problem+json": components["schemas"]["Problem"];
+                };
+            };
+            507: {
+                headers: {
+                    [name: string]: unknown;
+                };
+                content: {
+                    "application/problem+json": components["schemas"]["Problem"];
+                };
+            };
+        };
+    };
     list_options: {
         parameters: {
             query?: never;
@@ -2022,6 +2299,346 @@ export interface operations {
                 };
             };
             416: {
+                headers: {
+                    [name: string]: unknown;
+                };
+                content: {
+                    "application/problem+json": components["schemas"]["Problem"];
+                };
+            };
+        };
+    };
+    create_upload: {
+        parameters: {
+            query?: never;
+            header: {
+                /** @description 1.0.0 */
+                "Tus-Resumable": string;
+                /** @description Size of the file, bytes */
+                "Upload-Length"?: number | null;
+                /** @description 1: the size follows later */
+                "Upload-Defer-Length"?: number | null;
+                /** @description The run's fields */
+                "Upload-Metadata": string;
+                /** @description Of the piece in the body: sha1 or sha256, base64 */
+                "Upload-Checksum"?: string | null;
+                /** @description Makes the request safe to repeat */
+                "Idempotency-Key"?: string | null;
+            };
+            path?: never;
+            cookie?: never;
+        };
+        requestBody: {
+            content: {
+                "application/offset+octet-stream": number[];
+            };
+        };
+        responses: {
+            /** @description Location, Upload-Offset, Upload-Expires; Stria-Run, Stria-Job once whole */
+            201: {
+                headers: {
+                    [name: string]: unknown;
+                };
+                content?: never;
+            };
+            400: {
+                headers: {
+                    [name: string]: unknown;
+                };
+                content: {
+                    "application/problem+json": components["schemas"]["Problem"];
+                };
+            };
+            412: {
+                headers: {
+                    [name: string]: unknown;
+                };
+                content: {
+                    "application/problem+json": components["schemas"]["Problem"];
+                };
+            };
+            413: {
+                headers: {
+                    [name: string]: unknown;
+                };
+                content: {
+                    "application/problem+json": components["schemas"]["Problem"];
+                };
+            };
+            460: {
+                headers: {
+                    [name: string]: unknown;
+                };
+                content: {
+                    "application/problem+json": components["schemas"]["Problem"];
+                };
+            };
+            507: {
+                headers: {
+                    [name: string]: unknown;
+                };
+                content: {
+                    "application/problem+json": components["schemas"]["Problem"];
+                };
+            };
+        };
+    };
+    describe_uploads: {
+        parameters: {
+            query?: never;
+            header?: never;
+            path?: never;
+            cookie?: never;
+        };
+        requestBody?: never;
+        responses: {
+            /** @description Tus-Version, Tus-Extension, Tus-Max-Size, Tus-Checksum-Algorithm */
+            204: {
+                headers: {
+                    [name: string]: unknown;
+                };
+                content?: never;
+            };
+        };
+    };
+    send_piece_by_post: {
+        parameters: {
+            query?: never;
+            header: {
+                /** @description PATCH, HEAD or DELETE */
+                "X-HTTP-Method-Override": string;
+            };
+            path: {
+                /** @description The upload */
+                upload: string;
+            };
+            cookie?: never;
+        };
+        requestBody?: never;
+        responses: {
+            204: {
+                headers: {
+                    [name: string]: unknown;
+                };
+                content?: never;
+            };
+            405: {
+                headers: {
+                    [name: string]: unknown;
+                };
+                content: {
+                    "application/problem+json": components["schemas"]["Problem"];
+                };
+            };
+        };
+    };
+    delete_upload: {
+        parameters: {
+            query?: never;
+            header: {
+                /** @description 1.0.0 */
+                "Tus-Resumable": string;
+            };
+            path: {
+                /** @description The upload */
+                upload: string;
+            };
+            cookie?: never;
+        };
+        requestBody?: never;
+        responses: {
+            204: {
+                headers: {
+                    [name: string]: unknown;
+                };
+                content?: never;
+            };
+            404: {
+                headers: {
+                    [name: string]: unknown;
+                };
+                content: {
+                    "application/problem+json": components["schemas"]["Problem"];
+                };
+            };
+            410: {
+                headers: {
+                    [name: string]: unknown;
+                };
+                content: {
+                    "application/problem+json": components["schemas"]["Problem"];
+                };
+            };
+        };
+    };
+    describe_upload: {
+        parameters: {
+            query?: never;
+            header?: never;
+            path: {
+                /** @description The upload */
+                upload: string;
+            };
+            cookie?: never;
+        };
+        requestBody?: never;
+        responses: {
+            /** @description Tus-Version, Tus-Extension, Tus-Max-Size, Tus-Checksum-Algorithm */
+            204: {
+                headers: {
+                    [name: string]: unknown;
+                };
+                content?: never;
+            };
+        };
+    };
+    get_upload: {
+        parameters: {
+            query?: never;
+            header: {
+                /** @description 1.0.0 */
+                "Tus-Resumable": string;
+            };
+            path: {
+                /** @description The upload */
+                upload: string;
+            };
+            cookie?: never;
+        };
+        requestBody?: never;
+        responses: {
+            /** @description Upload-Offset, Upload-Length or Upload-Defer-Length, Upload-Metadata, Upload-Expires; Stria-Run and Stria-Job once whole */
+            200: {
+                headers: {
+                    [name: string]: unknown;
+                };
+                content?: never;
+            };
+            404: {
+                headers: {
+                    [name: string]: unknown;
+                };
+                content?: never;
+            };
+            410: {
+                headers: {
+                    [name: string]: unknown;
+                };
+                content?: never;
+            };
+            423: {
+                headers: {
+                    [name: string]: unknown;
+                };
+                content?: never;
+            };
+        };
+    };
+    send_piece: {
+        parameters: {
+            query?: never;
+            header: {
+                /** @description 1.0.0 */
+                "Tus-Resumable": string;
+                /** @description Where the piece begins: the upload's offset */
+                "Upload-Offset": number;
+                /** @description Size of the file, where it was deferred */
+                "Upload-Length"?: number | null;
+                /** @description Of the piece: sha1 or sha256, base64 */
+                "Upload-Checksum"?: string | null;
+            };
+            path: {
+                /** @description The upload */
+                upload: string;
+            };
+            cookie?: never;
+        };
+        requestBody: {
+            content: {
+                "application/offset+octet-stream": number[];
+            };
+        };
+        responses: {
+            /** @description Upload-Offset, Upload-Expires; Stria-Run, Stria-Job once whole */
+            204: {
+                headers: {
+                    [name: string]: unknown;
+                };
+                content?: never;
+            };
+            400: {
+                headers: {
+                    [name: string]: unknown;
+                };
+                content: {
+                    "application/problem+json": components["schemas"]["Problem"];
+                };
+            };
+            404: {
+                headers: {
+                    [name: string]: unknown;
+                };
+                content: {
+                    "application/problem+json": components["schemas"]["Problem"];
+                };
+            };
+            408: {
+                headers: {
+                    [name: string]: unknown;
+                };
+                content: {
+                    "application/problem+json": components["schemas"]["Problem"];
+                };
+            };
+            409: {
+                headers: {
+                    [name: string]: unknown;
+                };
+                content: {
+                    "application/problem+json": components["schemas"]["Problem"];
+                };
+            };
+            410: {
+                headers: {
+                    [name: string]: unknown;
+                };
+                content: {
+                    "application/problem+json": components["schemas"]["Problem"];
+                };
+            };
+            413: {
+                headers: {
+                    [name: string]: unknown;
+                };
+                content: {
+                    "application/problem+json": components["schemas"]["Problem"];
+                };
+            };
+            415: {
+                headers: {
+                    [name: string]: unknown;
+                };
+                content: {
+                    "application/problem+json": components["schemas"]["Problem"];
+                };
+            };
+            423: {
+                headers: {
+                    [name: string]: unknown;
+                };
+                content: {
+                    "application/problem+json": components["schemas"]["Problem"];
+                };
+            };
+            460: {
+                headers: {
+                    [name: string]: unknown;
+                };
+                content: {
+                    "application/problem+json": components["schemas"]["Problem"];
+                };
+            };
+            507: {
                 headers: {
                     [name: string]: unknown;
                 };

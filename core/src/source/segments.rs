@@ -12,7 +12,7 @@
 //! | `closed` | no further segments come |
 
 use std::fs::File;
-use std::io::Write;
+use std::io::{ErrorKind, Write};
 use std::os::fd::{AsRawFd, OwnedFd};
 use std::path::{Path, PathBuf};
 use std::sync::Arc;
@@ -95,7 +95,7 @@ impl SegmentFolder {
         let marker = path.join(names::KIND);
         let word = match std::fs::read_to_string(&marker) {
             Ok(word) => word,
-            Err(e) if e.kind() == std::io::ErrorKind::NotFound => return Ok(None),
+            Err(e) if matches!(e.kind(), ErrorKind::NotFound | ErrorKind::NotADirectory) => return Ok(None),
             Err(e) => return Err(Error::io(&marker, e)),
         };
         let kind = SegmentKind::of_extension(word.trim())
@@ -114,7 +114,7 @@ impl SegmentFolder {
             Ok(text) => Some(text.trim().parse().map_err(|_| {
                 Error::field(&self.name, names::part(self.next), format!("{text:?}"), "a time in ns since 1970")
             })?),
-            Err(e) if e.kind() == std::io::ErrorKind::NotFound => None,
+            Err(e) if e.kind() == ErrorKind::NotFound => None,
             Err(e) => return Err(Error::io(&part, e)),
         };
         Ok(Some(Segment { path, part_arrival_ns }))
@@ -226,7 +226,8 @@ impl StoredFrames {
     /// Waits for the first frame that can be decoded.
     pub(super) fn open(records: Records, files: Vec<PathBuf>) -> Result<StoredFrames> {
         let still_open = matches!(&records.files, RecordFiles::Folder(folder) if folder.is_open());
-        let info = SourceInfo { width_px: 0, height_px: 0, frames_announced: None, frames_per_s: None, files, still_open };
+        let info =
+            SourceInfo { width_px: 0, height_px: 0, frames_announced: None, frames_per_s: None, files, still_open };
         let mut frames = StoredFrames {
             info,
             records,
@@ -331,12 +332,7 @@ impl StreamPart {
             .name("segments".into())
             .spawn(move || feed(folder, writer, &told))
             .map_err(|e| Error::internal("source", format!("no thread: {e}")))?;
-        Ok(Some(StreamPart {
-            reader: reader.into(),
-            arrival_ns: first.part_arrival_ns,
-            stop,
-            feeder: Some(feeder),
-        }))
+        Ok(Some(StreamPart { reader: reader.into(), arrival_ns: first.part_arrival_ns, stop, feeder: Some(feeder) }))
     }
 
     /// The folder where this stream ends: the next part begins there.
@@ -368,7 +364,7 @@ fn feed(mut folder: SegmentFolder, mut pipe: std::io::PipeWriter, stop: &AtomicB
         match std::io::copy(&mut file, &mut pipe).and_then(|_| pipe.flush()) {
             Ok(()) => folder.advance(),
             // The demuxer gave this stream up; what follows in it is skipped, a new stream is not.
-            Err(e) if e.kind() == std::io::ErrorKind::BrokenPipe => {
+            Err(e) if e.kind() == ErrorKind::BrokenPipe => {
                 folder.advance();
                 while let Some(segment) = folder.present()?.filter(|s| s.part_arrival_ns.is_none()) {
                     drop(segment);
@@ -434,7 +430,8 @@ impl StoredStream {
             match opened {
                 Ok(video) => {
                     let first_ns = self.first_arrival_ns.or(part.arrival_ns);
-                    let since_first_ns = part.arrival_ns.zip(first_ns).map_or(0, |(now, first)| now.saturating_sub(first));
+                    let since_first_ns =
+                        part.arrival_ns.zip(first_ns).map_or(0, |(now, first)| now.saturating_sub(first));
                     self.first_arrival_ns = first_ns;
                     self.part_start_s = (since_first_ns as f64 / 1e9).max(self.last_time_s);
                     self.part_first_s = None;

@@ -88,8 +88,9 @@ pub(super) fn open_pipe(descriptor: RawFd, name: &str) -> Result<ffmpeg::format:
     super::init_ffmpeg();
     let mut options = input_options("pipe", "mpegts");
     options.set("analyzeduration", LIVE_PROBE_US);
-    ffmpeg::format::input_with_dictionary(format!("pipe:{descriptor}"), options)
-        .map_err(|e| Error::input(name, format!("not readable as MPEG-TS ({e})"), "an MPEG transport stream with video"))
+    ffmpeg::format::input_with_dictionary(format!("pipe:{descriptor}"), options).map_err(|e| {
+        Error::input(name, format!("not readable as MPEG-TS ({e})"), "an MPEG transport stream with video")
+    })
 }
 
 fn input_options(protocols: &str, containers: &str) -> ffmpeg::Dictionary {

@@ -14,9 +14,10 @@ use super::{Failed, Outcome, Success};
 use crate::config::{Config, GB, LiveLimits, RequestLimits, UploadLimits};
 use crate::error::Error;
 use crate::http::{self, App};
+use crate::live::Live;
 use crate::runs::Runs;
 use crate::uploads::Uploads;
-use crate::{incoming, retention};
+use crate::{incoming, live, retention};
 
 /// Run the service: runs come in over HTTP, jobs process them, staff look at the results in a browser
 #[derive(Args)]
@@ -90,9 +91,12 @@ async fn serve(config: Config) -> std::result::Result<(), Failed> {
     let (db, queue, store) = (engine.db.clone(), engine.queue.clone(), engine.store.clone());
     let runs = Runs::new(db.clone(), queue.clone(), store.clone());
     let uploads = Uploads::new(db.clone(), store.clone(), runs.clone(), config.uploads.clone());
+    let live = Live::new(db.clone(), store.clone(), runs.clone(), queue.bell().clone(), config.live.clone());
     let app = App {
         runs,
         uploads: uploads.clone(),
+        live: live.clone(),
+        streams: Arc::new(Semaphore::new(config.live.streams_at_once)),
         queue: queue.clone(),
         store: store.clone(),
         arrivals: Arc::new(Semaphore::new(config.requests.uploads_at_once)),
@@ -102,6 +106,7 @@ async fn serve(config: Config) -> std::result::Result<(), Failed> {
 
     let work = tokio::spawn(worker.run(config.workers));
     let sweep = tokio::spawn(retention::run(db.clone(), store, uploads, queue.bell().clone(), stop.clone()));
+    let watch = tokio::spawn(live::watch(live, stop.clone()));
     let requests = config.requests.clone();
     let answer = tokio::spawn(http::connection::serve(listener, http::router(app), requests, stop.clone()));
     println!("Stria is ready at http://{address}/");
@@ -118,6 +123,7 @@ async fn serve(config: Config) -> std::result::Result<(), Failed> {
     let end = async {
         let _ = answer.await;
         let _ = sweep.await;
+        let _ = watch.await;
         match work.await {
             Ok(result) => result,
             Err(e) => Err(Error::Internal(format!("the workers stopped: {e}"))),

@@ -311,6 +311,7 @@ pub mod source_segment {
         pub run_id: String,
         #[sea_orm(primary_key, auto_increment = false)]
         pub number: i64,
+        pub fence: i64,
         pub bytes: i64,
         pub sha256: String,
         pub frames: i64,
@@ -343,6 +344,7 @@ pub mod stream {
         pub segments: i64,
         pub bytes: i64,
         pub missing: String,
+        pub hash_state: String,
         pub opened_ms: i64,
     }
 

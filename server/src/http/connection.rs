@@ -2,20 +2,20 @@
 
 use std::io;
 use std::net::SocketAddr;
-use std::pin::Pin;
+use std::pin::{Pin, pin};
 use std::sync::Arc;
 use std::task::{Context, Poll, ready};
 use std::time::Duration;
 
 use axum::Router;
 use hyper_util::rt::{TokioIo, TokioTimer};
-use hyper_util::server::graceful::GracefulShutdown;
 use hyper_util::service::TowerToHyperService;
 use tokio::io::{AsyncRead, AsyncWrite, ReadBuf};
 use tokio::net::{TcpListener, TcpStream};
 use tokio::sync::Semaphore;
 use tokio::time::{Instant, Sleep};
 use tokio_util::sync::CancellationToken;
+use tokio_util::task::TaskTracker;
 
 use crate::config::RequestLimits;
 
@@ -25,7 +25,7 @@ const ACCEPT_PAUSE: Duration = Duration::from_millis(200);
 /// Serves until asked to stop, then lets open requests end within their grace.
 pub async fn serve(listener: TcpListener, router: Router, limits: RequestLimits, stop: CancellationToken) {
     let places = Arc::new(Semaphore::new(limits.connections));
-    let graceful = GracefulShutdown::new();
+    let open = TaskTracker::new();
     loop {
         let accepted = tokio::select! {
             place = places.clone().acquire_owned() => match place {
@@ -45,13 +45,23 @@ pub async fn serve(listener: TcpListener, router: Router, limits: RequestLimits,
                 continue;
             }
         };
-        let connection = http1(&limits).serve_connection(
-            TokioIo::new(Impatient::new(stream, limits.receiver_silence)),
-            TowerToHyperService::new(router.clone()),
-        );
-        let connection = graceful.watch(connection);
-        tokio::spawn(async move {
-            if let Err(error) = connection.await {
+        let connection = http1(&limits)
+            .serve_connection(
+                TokioIo::new(Impatient::new(stream, limits.receiver_silence)),
+                TowerToHyperService::new(router.clone()),
+            )
+            .with_upgrades();
+        let stop = stop.clone();
+        open.spawn(async move {
+            let mut connection = pin!(connection);
+            let served = tokio::select! {
+                served = connection.as_mut() => served,
+                () = stop.cancelled() => {
+                    connection.as_mut().graceful_shutdown();
+                    connection.await
+                }
+            };
+            if let Err(error) = served {
                 // Clients leave in all ways; that is their right and no news.
                 tracing::debug!(%error, %peer, "a connection ended early");
             }
@@ -59,7 +69,8 @@ pub async fn serve(listener: TcpListener, router: Router, limits: RequestLimits,
         });
     }
     drop(listener);
-    let _ = tokio::time::timeout(limits.stop_grace, graceful.shutdown()).await;
+    open.close();
+    let _ = tokio::time::timeout(limits.stop_grace, open.wait()).await;
 }
 
 fn http1(limits: &RequestLimits) -> hyper::server::conn::http1::Builder {

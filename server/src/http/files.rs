@@ -9,6 +9,8 @@ use axum::http::header::{
 };
 use axum::http::{HeaderMap, Method, StatusCode};
 use axum::response::{IntoResponse, Response};
+use bytes::Bytes;
+use futures::stream::{BoxStream, StreamExt, TryStreamExt};
 
 use super::problem::Refusal;
 use crate::error::Result;
@@ -21,8 +23,8 @@ pub(super) const REVALIDATE: &str = "no-cache";
 
 /// A file and how to send it.
 pub(super) struct FileAnswer {
-    /// Where it lies.
-    pub key: Key,
+    /// Where it lies: its parts in order, each with its size in bytes.
+    pub parts: Vec<(Key, u64)>,
     /// Its size and hash; the hash is the ETag.
     pub facts: Facts,
     /// Its kind.
@@ -56,9 +58,38 @@ pub(super) async fn send(store: &Store, method: &Method, asked: &HeaderMap, file
     }
     let body = match *method {
         Method::HEAD => Body::empty(),
-        _ => Body::from_stream(store.read(&file.key, range).await?),
+        _ => Body::from_stream(read(store, file.parts, range).await?),
     };
     Ok((status, headers_of(headers), body).into_response())
+}
+
+/// The bytes of a range of all parts together. The first part is opened before the answer begins.
+async fn read(
+    store: &Store,
+    parts: Vec<(Key, u64)>,
+    range: Range<u64>,
+) -> Result<BoxStream<'static, std::io::Result<Bytes>>> {
+    let mut wanted = wanted_parts(parts, &range).into_iter();
+    let Some((key, part)) = wanted.next() else { return Ok(futures::stream::empty().boxed()) };
+    let first = store.read(&key, part).await?;
+    let store = store.clone();
+    let rest = futures::stream::iter(wanted).then(move |(key, part)| {
+        let store = store.clone();
+        async move { store.read(&key, part).await.map_err(std::io::Error::other) }
+    });
+    Ok(first.chain(rest.try_flatten()).boxed())
+}
+
+/// The parts that a range touches, each with the range inside it.
+fn wanted_parts(parts: Vec<(Key, u64)>, range: &Range<u64>) -> Vec<(Key, Range<u64>)> {
+    let mut begin = 0;
+    let inside = parts.into_iter().filter_map(|(key, bytes)| {
+        let (from, to) = (range.start.clamp(begin, begin + bytes), range.end.clamp(begin, begin + bytes));
+        let part = (from < to).then_some((key, from - begin..to - begin));
+        begin += bytes;
+        part
+    });
+    inside.collect()
 }
 
 fn headers_of(pairs: Vec<(axum::http::HeaderName, String)>) -> HeaderMap {

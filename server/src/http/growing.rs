@@ -53,7 +53,8 @@ async fn send(app: &App, job: &str, name: &str, method: &Method, asked: &HeaderM
     let (key, published) = app.runs.growing_file(job, name).await?;
     let content_type = content_type(name);
     if let Some(facts) = published {
-        let answer = FileAnswer { key, facts, content_type, cache: IMMUTABLE, save_as: None };
+        let parts = vec![(key, facts.bytes)];
+        let answer = FileAnswer { parts, facts, content_type, cache: IMMUTABLE, save_as: None };
         return files::send(&app.store, method, asked, answer).await;
     }
     let missing = || Error::NotFound { what: "file", id: name.into() };

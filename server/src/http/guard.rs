@@ -5,7 +5,7 @@
 //! pointing its own name at this address (DNS rebinding).
 
 use axum::extract::{Request, State};
-use axum::http::header::{CONTENT_SECURITY_POLICY, HOST, ORIGIN, REFERRER_POLICY, X_CONTENT_TYPE_OPTIONS};
+use axum::http::header::{CONTENT_SECURITY_POLICY, HOST, ORIGIN, REFERRER_POLICY, UPGRADE, X_CONTENT_TYPE_OPTIONS};
 use axum::http::{HeaderMap, HeaderValue, Method};
 use axum::middleware::Next;
 use axum::response::{IntoResponse, Response};
@@ -25,7 +25,11 @@ pub(super) async fn own_origin_only(State(app): State<App>, request: Request, ne
         return error.into_response();
     }
     let reads = matches!(*request.method(), Method::GET | Method::HEAD | Method::OPTIONS);
-    if !reads && let Err(error) = check_origin(headers) {
+    // A page of any origin may open a WebSocket: that is as good as a write.
+    let upgrades = headers.contains_key(UPGRADE);
+    if (!reads || upgrades)
+        && let Err(error) = check_origin(headers)
+    {
         return error.into_response();
     }
     next.run(request).await

@@ -126,7 +126,7 @@ async fn send_product(app: &App, job: &str, name: &str, method: &Method, headers
     let content_type = content_type(name);
     let save = content_type == "application/octet-stream";
     let answer = FileAnswer {
-        key: product.key,
+        parts: vec![(product.key, product.facts.bytes)],
         facts: product.facts,
         content_type,
         cache: IMMUTABLE,

@@ -31,59 +31,62 @@ fn checksum_mismatch() -> StatusCode {
 
 impl IntoResponse for Error {
     fn into_response(self) -> Response {
-        let detail = self.to_string();
-        if self.is_storage_full() {
-            tracing::error!(%detail, "the disk is full");
-            return answer(StatusCode::INSUFFICIENT_STORAGE, "storage-full", "The server's disk is full", detail, true);
+        let problem = problem_of(self);
+        let status = problem.status.and_then(|code| StatusCode::from_u16(code).ok());
+        let status = status.unwrap_or(StatusCode::INTERNAL_SERVER_ERROR);
+        let mut response = send(status, &problem);
+        if status == StatusCode::SERVICE_UNAVAILABLE {
+            response.headers_mut().insert(RETRY_AFTER, HeaderValue::from_static("5"));
         }
-        if self.is_passing() {
-            tracing::warn!(%detail, "the records or the store do not answer");
-            return Error::Busy("the server's records or files do not answer; come back in a moment".into())
-                .into_response();
+        response
+    }
+}
+
+/// What a client is told of an error, over HTTP or a WebSocket.
+pub(super) fn problem_of(error: Error) -> Problem {
+    let detail = error.to_string();
+    if error.is_storage_full() {
+        tracing::error!(%detail, "the disk is full");
+        return problem(StatusCode::INSUFFICIENT_STORAGE, "storage-full", "The server's disk is full", detail, true);
+    }
+    if error.is_passing() {
+        tracing::warn!(%detail, "the records or the store do not answer");
+        return problem_of(Error::Busy("the server's records or files do not answer; come back in a moment".into()));
+    }
+    match error {
+        Error::NotFound { .. } => {
+            problem(StatusCode::NOT_FOUND, "not-found", "Nothing of that name exists", detail, false)
         }
-        match self {
-            Error::NotFound { .. } => {
-                answer(StatusCode::NOT_FOUND, "not-found", "Nothing of that name exists", detail, false)
-            }
-            Error::Input { field, expected, .. } => {
-                let mut problem =
-                    problem(StatusCode::BAD_REQUEST, "bad-input", "The request cannot be used", detail, false);
-                (problem.field, problem.expected) = (field, expected);
-                send(StatusCode::BAD_REQUEST, &problem)
-            }
-            Error::Conflict(_) => {
-                answer(StatusCode::CONFLICT, "conflict", "Its present state does not allow it", detail, false)
-            }
-            Error::Locked(_) => {
-                answer(StatusCode::LOCKED, "locked", "Another request is writing to it", detail, true)
-            }
-            Error::Gone(_) => answer(StatusCode::GONE, "gone", "It is no more", detail, false),
-            Error::Checksum(_) => {
-                answer(checksum_mismatch(), "checksum-mismatch", "Not what was announced", detail, true)
-            }
-            Error::KeyReused(_) => {
-                let title = "The idempotency key belongs to another request";
-                answer(StatusCode::UNPROCESSABLE_ENTITY, "key-reused", title, detail, false)
-            }
-            Error::TooLarge { .. } => {
-                answer(StatusCode::PAYLOAD_TOO_LARGE, "too-large", "The request is too large", detail, false)
-            }
-            Error::SenderSilent => {
-                answer(StatusCode::REQUEST_TIMEOUT, "incomplete", "The request did not arrive whole", detail, true)
-            }
-            Error::Busy(_) => {
-                let mut response = answer(StatusCode::SERVICE_UNAVAILABLE, "busy", "The server is busy", detail, true);
-                response.headers_mut().insert(RETRY_AFTER, HeaderValue::from_static("5"));
-                response
-            }
-            Error::Foreign(_) => {
-                answer(StatusCode::FORBIDDEN, "foreign-origin", "The request comes from elsewhere", detail, false)
-            }
-            Error::LeaseLost | Error::Records(_) | Error::Store(_) | Error::Io { .. } | Error::Internal(_) => {
-                // The cause is for the log; what leaves the server names no folder of it.
-                tracing::error!(%detail, "a request failed");
-                internal()
-            }
+        Error::Input { field, expected, .. } => Problem {
+            field,
+            expected,
+            ..problem(StatusCode::BAD_REQUEST, "bad-input", "The request cannot be used", detail, false)
+        },
+        Error::Conflict(_) => {
+            problem(StatusCode::CONFLICT, "conflict", "Its present state does not allow it", detail, false)
+        }
+        Error::Locked(_) => problem(StatusCode::LOCKED, "locked", "Another request is writing to it", detail, true),
+        Error::Gone(_) => problem(StatusCode::GONE, "gone", "It is no more", detail, false),
+        Error::Checksum(_) => problem(checksum_mismatch(), "checksum-mismatch", "Not what was announced", detail, true),
+        Error::KeyReused(_) => {
+            let title = "The idempotency key belongs to another request";
+            problem(StatusCode::UNPROCESSABLE_ENTITY, "key-reused", title, detail, false)
+        }
+        Error::TooLarge { .. } => {
+            problem(StatusCode::PAYLOAD_TOO_LARGE, "too-large", "The request is too large", detail, false)
+        }
+        Error::SenderSilent => {
+            problem(StatusCode::REQUEST_TIMEOUT, "incomplete", "The request did not arrive whole", detail, true)
+        }
+        Error::Busy(_) => problem(StatusCode::SERVICE_UNAVAILABLE, "busy", "The server is busy", detail, true),
+        Error::Foreign(_) => {
+            problem(StatusCode::FORBIDDEN, "foreign-origin", "The request comes from elsewhere", detail, false)
+        }
+        Error::LeaseLost | Error::Records(_) | Error::Store(_) | Error::Io { .. } | Error::Internal(_) => {
+            // The cause is for the log; what leaves the server names no folder of it.
+            tracing::error!(%detail, "a request failed");
+            let detail = "the server failed; its log says why".into();
+            problem(StatusCode::INTERNAL_SERVER_ERROR, "internal", "The server failed", detail, true)
         }
     }
 }

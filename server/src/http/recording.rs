@@ -32,7 +32,7 @@ pub(super) async fn get_segment(
 ) -> Result<Response> {
     let segment = app.runs.segment(&job, number).await?;
     let answer = FileAnswer {
-        key: segment.key,
+        parts: vec![(segment.key, segment.facts.bytes)],
         facts: segment.facts,
         content_type: "application/octet-stream",
         // Another attempt may bring another segment of the same number.

@@ -89,7 +89,7 @@ pub(super) async fn get_source(
     let source = app.runs.source(&run).await?;
     let answer = FileAnswer {
         content_type: content_type(&source.filename.to_ascii_lowercase()),
-        key: source.key,
+        parts: source.parts,
         facts: source.facts,
         cache: IMMUTABLE,
         save_as: Some(source.filename),

@@ -40,6 +40,7 @@ ALTER TABLE runs ADD COLUMN source_open INTEGER NOT NULL DEFAULT 0;
 CREATE TABLE source_segments (
     run_id TEXT NOT NULL REFERENCES runs (id) ON DELETE CASCADE,
     number BIGINT NOT NULL,
+    fence BIGINT NOT NULL,
     bytes BIGINT NOT NULL,
     sha256 TEXT NOT NULL,
     frames BIGINT NOT NULL,
@@ -63,6 +64,7 @@ CREATE TABLE streams (
     segments BIGINT NOT NULL,
     bytes BIGINT NOT NULL,
     missing TEXT NOT NULL,
+    hash_state TEXT NOT NULL,
     opened_ms BIGINT NOT NULL
 );
 CREATE INDEX streams_by_state ON streams (is_open);

@@ -41,7 +41,9 @@ pub struct Lease {
     pub filename: String,
     /// The extension of the source's key.
     pub source_extension: String,
-    /// The source's size and hash.
+    /// [`crate::source::FILE`], or what its segments hold.
+    pub source_kind: String,
+    /// The source's size and hash, where it is one file.
     pub source: Facts,
     /// Frames a second, where the sender said so.
     pub fps: Option<f64>,
@@ -60,6 +62,7 @@ impl Lease {
             recipe_toml: job.recipe_toml,
             filename: run.filename,
             source_extension: run.source_extension,
+            source_kind: run.source_kind,
             source: Facts { bytes: run.source_bytes.unsigned_abs(), sha256: run.source_sha256 },
             fps: run.fps,
             recorded_ms: run.recorded_ms,

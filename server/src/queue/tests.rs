@@ -43,6 +43,8 @@ impl Records {
             rig_name: Set("rig".into()),
             state: Set("queued".into()),
             latest_job: Set(String::new()),
+            source_kind: Set(crate::source::FILE.into()),
+            source_open: Set(0),
         };
         run::Entity::insert(row).exec_without_returning(self.db.read()).await.expect("inserts");
         let new = NewJob {
@@ -57,7 +59,7 @@ impl Records {
     }
 
     async fn claim(&self) -> Option<Lease> {
-        self.queue.claim("node", "worker").await.expect("claims")
+        self.queue.claim(Wanted::Any, "node", "worker").await.expect("claims")
     }
 
     async fn job(&self, id: &str) -> job::Model {
@@ -107,7 +109,7 @@ async fn many_workers_never_share_a_job() {
         let queue = r.queue.clone();
         tasks.push(tokio::spawn(async move {
             let mut mine = Vec::new();
-            while let Some(lease) = queue.claim("node", &worker.to_string()).await.expect("claims") {
+            while let Some(lease) = queue.claim(Wanted::Any, "node", &worker.to_string()).await.expect("claims") {
                 mine.push(lease.job);
             }
             mine

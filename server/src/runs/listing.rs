@@ -10,7 +10,6 @@ use super::{Runs, read_time, to_u64};
 use crate::db::tables::{asset, job, run, worker};
 use crate::error::{Error, Result};
 use crate::queue::state_of;
-use crate::store::Facts;
 use crate::wire::time::to_text;
 use crate::wire::{self, Direction, JobState, Priority};
 
@@ -268,12 +267,13 @@ impl Runs {
 pub(super) fn run_of(row: run::Model, latest: Option<job::Model>) -> Result<wire::Run> {
     let latest = latest.ok_or_else(|| Error::NotFound { what: "run", id: row.id.clone() })?;
     let job = job_of(latest)?;
-    let facts = Facts { bytes: to_u64(row.source_bytes), sha256: row.source_sha256 };
+    let open = row.source_open != 0;
     Ok(wire::Run {
         source: wire::RunSource {
             filename: row.filename,
-            bytes: facts.bytes,
-            sha256: facts.sha256,
+            open,
+            bytes: to_u64(row.source_bytes),
+            sha256: (!open).then_some(row.source_sha256),
             fps: row.fps,
             url: format!("/api/runs/{}/source", row.id),
         },

@@ -1,8 +1,8 @@
 //! Rigs and recipes: as text in a request, as stored rows, as built-in names.
 
-use serde::{Deserialize, Serialize};
 use sea_orm::sea_query::OnConflict;
 use sea_orm::{ActiveValue::Set, ColumnTrait, ConnectionTrait, EntityTrait, QueryFilter, QueryOrder, QuerySelect};
+use serde::{Deserialize, Serialize};
 use stria_core::recipe::{self, Recipe};
 use stria_core::rig::Rig;
 

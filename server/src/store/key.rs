@@ -24,9 +24,10 @@ impl Key {
         Key::new(format!("{}source{}", run_prefix(run), dotted(extension)))
     }
 
-    /// A part of a run's images, from 0.
-    pub fn source_segment(run: &str, number: u32, extension: &str) -> Key {
-        Key::new(format!("{}segments/{number:06}{}", run_prefix(run), dotted(extension)))
+    /// A part of a run's images, from 0. The fence keeps a connection that was taken over from writing into its
+    /// successor's segments.
+    pub fn source_segment(run: &str, number: u32, fence: i64, extension: &str) -> Key {
+        Key::new(format!("{}segments/{number:06}-{fence}{}", run_prefix(run), dotted(extension)))
     }
 
     /// A part of an upload that is not a run yet, from 0.
@@ -136,8 +137,8 @@ mod tests {
 
     #[test]
     fn keys_sort_by_their_numbers() {
-        assert_eq!(Key::source_segment("r", 7, "mp4").as_str(), "runs/r/segments/000007.mp4");
-        assert_eq!(Key::source_segment("r", 7, "mp4").filename(), "000007.mp4");
+        assert_eq!(Key::source_segment("r", 7, 2, "mp4").as_str(), "runs/r/segments/000007-2.mp4");
+        assert_eq!(Key::source_segment("r", 7, 2, "mp4").filename(), "000007-2.mp4");
         assert!(Key::upload_part("u", 9) < Key::upload_part("u", 10));
     }
 }

@@ -7,14 +7,14 @@ use std::path::PathBuf;
 use bytes::Bytes;
 use sha2_resumable::Sha256;
 use sha2_resumable::digest::Digest;
-use sha2_resumable::digest::common::hazmat::{SerializableState, SerializedState};
 use tokio::fs::File;
 use tokio::io::{AsyncSeekExt, AsyncWriteExt};
 
 use super::{prefix_of, to_i64, to_u64};
 use crate::db::tables::upload;
 use crate::error::{Error, Result};
-use crate::store::{Facts, Key, Store, hex};
+use crate::resumed_hash;
+use crate::store::{Facts, Key, Store};
 
 /// An upload's bytes, open for more.
 pub(super) struct BytesSoFar {
@@ -57,7 +57,7 @@ impl BytesSoFar {
     /// Opens them as the row promises them: what came after that and was not promised is dropped.
     pub(super) async fn open(store: &Store, row: &mut upload::Model, parts: Vec<String>) -> Result<BytesSoFar> {
         let offset_bytes = to_u64(row.offset_bytes);
-        let hash = read_hash(&row.hash_state)?;
+        let hash = resumed_hash::read(&row.hash_state)?;
         let place = match file_of(store, row) {
             Some(path) => Place::Folder { file: open_file(&path, offset_bytes).await?, path },
             None => Place::Bucket(Box::new(Parts::open(store, row, parts).await?)),
@@ -82,7 +82,7 @@ impl BytesSoFar {
 
     /// Makes all of it durable.
     pub(super) async fn make_durable(&mut self) -> Result<Progress> {
-        let state = hex(self.hash.serialize().as_ref());
+        let state = resumed_hash::write(&self.hash);
         match &mut self.place {
             Place::Folder { path, file } => {
                 let failed = |e| Error::io(path.as_path(), e);
@@ -114,7 +114,9 @@ impl BytesSoFar {
     /// The new tail is promised: the one before goes.
     pub(super) async fn forget_old_tail(&mut self) {
         let Place::Bucket(parts) = &mut self.place else { return };
-        let Some(old) = parts.old_tail.replace(parts.tail_number).filter(|old| *old != parts.tail_number) else { return };
+        let Some(old) = parts.old_tail.replace(parts.tail_number).filter(|old| *old != parts.tail_number) else {
+            return;
+        };
         let gone = match number(old) {
             Ok(old) => parts.store.delete(&Key::upload_part(&parts.upload, old)).await,
             Err(error) => Err(error),
@@ -158,7 +160,9 @@ impl Parts {
         row.parts_name = Some(name.clone());
         let tail = match row.tail_bytes {
             0 => Vec::new(),
-            bytes => store.get_bytes(&Key::upload_part(&row.id, number(row.tail_number)?), to_u64(bytes)).await?.to_vec(),
+            bytes => {
+                store.get_bytes(&Key::upload_part(&row.id, number(row.tail_number)?), to_u64(bytes)).await?.to_vec()
+            }
         };
         let expected = row.offset_bytes - row.part_bytes * parts.len() as i64;
         if tail.len() as i64 != expected {
@@ -251,22 +255,6 @@ pub(super) async fn drop_tails(store: &Store, row: &upload::Model) -> Result<()>
     store.delete_prefix(&prefix_of(row)).await
 }
 
-/// The SHA-256 of all bytes, from the state of its calculation.
-pub(super) fn sha256_of_state(state: &str) -> Result<String> {
-    Ok(hex(&read_hash(state)?.finalize()))
-}
-
-fn read_hash(state: &str) -> Result<Sha256> {
-    if state.is_empty() {
-        return Ok(Sha256::new());
-    }
-    let broken = || Error::Internal("an upload's hash state cannot be read".into());
-    let digit = |i: usize| u8::from_str_radix(state.get(i..i + 2)?, 16).ok();
-    let bytes: Option<Vec<u8>> = (0..state.len()).step_by(2).map(digit).collect();
-    let state = SerializedState::<Sha256>::try_from(bytes.ok_or_else(broken)?.as_slice()).map_err(|_| broken())?;
-    Sha256::deserialize(&state).map_err(|_| broken())
-}
-
 /// The growing file, where the store is a folder: on the store's own disk, so that a rename is all it takes in the end.
 fn file_of(store: &Store, row: &upload::Model) -> Option<PathBuf> {
     Some(store.folder()?.join(Key::upload(&row.id).as_str()))
@@ -281,24 +269,4 @@ fn source_key(row: &upload::Model) -> Result<Key> {
 
 fn number(value: i64) -> Result<u32> {
     u32::try_from(value).map_err(|_| Error::Internal(format!("{value} is no number of a part")))
-}
-
-#[cfg(test)]
-mod tests {
-    use super::*;
-
-    #[test]
-    fn a_hash_goes_on_where_it_was_put_down() {
-        let data: Vec<u8> = (0..1000u32).map(|i| (i * 7) as u8).collect();
-        let whole = hex(&Sha256::digest(&data));
-        for cut in [0, 1, 63, 64, 65, 640, 999, 1000] {
-            let mut first = Sha256::new();
-            first.update(&data[..cut]);
-            let mut second = read_hash(&hex(first.serialize().as_ref())).expect("a state");
-            second.update(&data[cut..]);
-            assert_eq!(sha256_of_state(&hex(second.serialize().as_ref())).expect("a state"), whole, "cut at {cut}");
-        }
-        assert_eq!(sha256_of_state("").expect("empty"), hex(&Sha256::digest(b"")));
-        assert!(read_hash("00").is_err() && read_hash("zz").is_err());
-    }
 }

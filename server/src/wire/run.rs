@@ -36,10 +36,12 @@ impl Direction {
 pub struct RunSource {
     /// The file's own name, as its sender gave it.
     pub filename: String,
-    /// Size, bytes.
+    /// The robot still sends: there will be more.
+    pub open: bool,
+    /// Size, bytes; so far, while it is open.
     pub bytes: u64,
-    /// SHA-256 in lower-case hex.
-    pub sha256: String,
+    /// SHA-256 in lower-case hex; not known while it is open.
+    pub sha256: Option<String>,
     /// Frames a second, where the sender said so.
     pub fps: Option<f64>,
     /// Where to get it back, byte for byte.

@@ -7,12 +7,12 @@ use tokio::sync::watch;
 use tokio::time::Instant;
 
 use super::child::{Child, Said};
+use super::follow::Source;
 use super::scratch::Scratch;
 use super::showcase::Showcase;
 use super::{Worker, publish};
 use crate::error::{Error, Result};
 use crate::queue::{Lease, Outcome, Progress, Signal};
-use crate::store::Key;
 use crate::wire::child::Failure;
 
 /// The stage after the last product is written: the products go into the store.
@@ -118,12 +118,12 @@ async fn work(worker: &Worker, lease: &Lease, mut signals: watch::Receiver<Signa
     let begins = format!("attempt {} begins on worker '{}'", lease.attempt, worker.name);
     may_pass(worker.queue.log(lease, &begins).await)?;
     let scratch = Scratch::make(&worker.scratch, lease).await?;
-    let key = Key::source(&lease.run, &lease.source_extension);
     let source = tokio::select! {
-        copied = worker.store.local_copy(&key, &lease.source, scratch.folder()) => copied?,
+        source = Source::open(worker, lease, scratch.folder()) => source?,
         ended = interrupted(worker, &mut signals) => return Ok(ended),
     };
-    let mut child = Child::start(worker, lease, &scratch, &source)?;
+    let lease = &Lease { recorded_ms: source.recorded_ms, ..lease.clone() };
+    let mut child = Child::start(worker, lease, &scratch, &source.path)?;
     let deadline = Instant::now() + worker.limits.time_limit;
     let mut teller = Teller {
         worker,
@@ -142,6 +142,7 @@ async fn work(worker: &Worker, lease: &Lease, mut signals: watch::Receiver<Signa
     };
     let result = tokio::select! {
         result = listened => Ok(result?),
+        failed = source.follow(worker, lease) => return Err(failed),
         ended = interrupted(worker, &mut signals) => Err(ended),
         () = tokio::time::sleep_until(deadline) => Err(Ended::Failed(too_long(worker.limits.time_limit))),
     };

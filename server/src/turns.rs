@@ -1,4 +1,5 @@
-//! Whose turn it is to write to an upload, within this process.
+//! Whose turn it is to write to a thing (an upload, a stream), within this process: a newer request takes over from an
+//! older one, whose connection is often dead already.
 
 use std::collections::HashMap;
 use std::sync::{Arc, Mutex, PoisonError};
@@ -12,7 +13,7 @@ use crate::error::{Error, Result};
 
 /// The turns that are taken.
 #[derive(Default)]
-pub(super) struct Turns(Mutex<HashMap<String, Taken>>);
+pub struct Turns(Mutex<HashMap<String, Taken>>);
 
 struct Taken {
     wanted: CancellationToken,
@@ -21,7 +22,7 @@ struct Taken {
 }
 
 /// A turn; it ends when this is dropped.
-pub(super) struct Turn {
+pub struct Turn {
     turns: Arc<Turns>,
     id: String,
     wanted: CancellationToken,
@@ -30,7 +31,7 @@ pub(super) struct Turn {
 
 impl Turns {
     /// Tells whoever has the turn to end it, waits for that at most `patience`, and takes it.
-    pub(super) async fn take(self: &Arc<Turns>, id: &str, patience: Duration) -> Result<Turn> {
+    pub async fn take(self: &Arc<Turns>, id: &str, patience: Duration) -> Result<Turn> {
         let deadline = Instant::now() + patience;
         loop {
             let mut ended = match self.try_take(id) {
@@ -39,7 +40,7 @@ impl Turns {
             };
             // The channel never carries anything: it closes.
             if tokio::time::timeout_at(deadline, ended.changed()).await.is_err() {
-                return Err(Error::Locked("another request is writing to the upload and does not let go".into()));
+                return Err(Error::Locked("another request is writing to it and does not let go".into()));
             }
         }
     }
@@ -59,7 +60,7 @@ impl Turns {
 
 impl Turn {
     /// Cancelled when another request wants the turn.
-    pub(super) fn wanted(&self) -> &CancellationToken {
+    pub fn wanted(&self) -> &CancellationToken {
         &self.wanted
     }
 }
