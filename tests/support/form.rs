@@ -26,3 +26,9 @@ pub fn form(fields: &[(&str, &str)], filename: &str, file: &[u8]) -> Vec<u8> {
     body.extend_from_slice(format!("\r\n--{BOUNDARY}--\r\n").as_bytes());
     body
 }
+
+/// A text as the value of a query parameter.
+pub fn percent_encoded(text: &str) -> String {
+    let plain = |b: u8| b.is_ascii_alphanumeric() || b"-_.~".contains(&b);
+    text.bytes().map(|b| if plain(b) { char::from(b).to_string() } else { format!("%{b:02X}") }).collect()
+}

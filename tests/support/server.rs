@@ -51,13 +51,16 @@ impl Server {
         server
     }
 
-    /// Starts it (again) on its folder; its port is another each time.
+    /// Starts it (again) on its folder; its port is another each time, unless a flag says which.
     ///
     /// # Panics
     /// Where it does not become ready.
     pub fn start_again(&mut self) {
+        let listens = self.flags.iter().any(|flag| flag == "--listen");
         let mut process = Command::new(stria())
-            .args(["serve", "--listen", "127.0.0.1:0", "--data"])
+            .arg("serve")
+            .args(if listens { &[][..] } else { &["--listen", "127.0.0.1:0"] })
+            .arg("--data")
             .arg(self.data())
             .args(&self.flags)
             .env("STRIA_LOG", std::env::var("STRIA_LOG").unwrap_or_else(|_| "warn".into()))

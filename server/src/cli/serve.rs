@@ -4,6 +4,7 @@ use std::io::Write;
 use std::net::SocketAddr;
 use std::path::PathBuf;
 use std::sync::Arc;
+use std::time::Duration;
 
 use clap::Args;
 use tokio::sync::Semaphore;
@@ -41,6 +42,9 @@ pub(super) struct Serve {
     /// Largest upload, GB
     #[arg(long, value_name = "GB", default_value_t = 64.0, env = "STRIA_MAX_UPLOAD_GB")]
     max_upload_gb: f64,
+    /// How long a robot whose connection broke may stay away before its live run is closed, s
+    #[arg(long, value_name = "S", default_value_t = 60.0, env = "STRIA_LIVE_COME_BACK_S")]
+    live_come_back_s: f64,
     #[command(flatten)]
     jobs: JobArgs,
     /// Listen on a network although there is no authentication: whoever reaches the port can do everything
@@ -65,13 +69,14 @@ impl Serve {
             )));
         }
         let upload_bytes = (positive("--max-upload-gb", self.max_upload_gb, 1e6, "GB")? * GB as f64) as u64;
+        let come_back = Duration::from_secs_f64(positive("--live-come-back-s", self.live_come_back_s, 1e6, "s")?);
         Ok(Config {
             listen: self.listen,
             places: self.places.places(&self.data)?,
             workers: slots("--workers", self.workers)?,
             requests: RequestLimits { upload_bytes, ..RequestLimits::default() },
             uploads: UploadLimits { upload_bytes, ..UploadLimits::default() },
-            live: LiveLimits::default(),
+            live: LiveLimits { come_back, ..LiveLimits::default() },
             jobs: self.jobs.limits()?,
         })
     }
