@@ -16,6 +16,7 @@ use std::path::PathBuf;
 use std::sync::Arc;
 use std::time::{Duration, Instant};
 
+use nalgebra::Point3;
 use serde::{Deserialize, Serialize};
 
 use crate::depth_map::sheet::WallColours;
@@ -218,6 +219,13 @@ struct Cargo {
     colours: Colours,
     /// Only for the frames whose picture the recording shows.
     picture: Option<Picture>,
+}
+
+/// The newest profile, where it is thought to be before its place is final.
+struct Newest {
+    frame: u32,
+    time_s: f64,
+    points_in_world: Vec<Point3<f64>>,
 }
 
 /// A frame as the recording shows it.

@@ -26,7 +26,7 @@ use std::time::Duration;
 
 use jpeg_encoder::ColorType;
 use nalgebra::Point3;
-use rerun::{EncodedImage, StoreId, StoreKind, TextDocument, TextLog, ViewCoordinates};
+use rerun::{EncodedImage, Points3D, StoreId, StoreKind, TextDocument, TextLog, ViewCoordinates};
 
 pub use self::store::Segment;
 
@@ -57,6 +57,7 @@ mod entity {
     pub(super) const SURFACE: &str = "world/surface";
     pub(super) const TRAJECTORY: &str = "world/trajectory";
     pub(super) const PROFILE: &str = "world/profile";
+    pub(super) const NEWEST: &str = "world/newest";
     pub(super) const CAMERA: &str = "world/camera";
     pub(super) const IMAGE: &str = "world/camera/image";
     pub(super) const SPOTS: &str = "world/camera/image/spots";
@@ -71,6 +72,9 @@ mod entity {
     pub(super) const MESSAGES: &str = "messages";
     pub(super) const GUIDE: &str = "guide";
 }
+
+/// Most points of the newest profile that are shown.
+const NEWEST_POINTS: usize = 200;
 
 /// Longest time between two live segments while the robot still walks, s.
 const WATCHED_SEGMENT_S: f64 = 0.25;
@@ -202,6 +206,20 @@ impl Recorder {
                 self.store.push(chunk)?;
             }
         }
+        let cut = self.store.segment_due(&self.budget.segments);
+        self.flush(cut, false)?;
+        if cut { self.cut() } else { Ok(vec![]) }
+    }
+
+    /// Shows the newest profile of a robot that still walks, where it is thought to be now: its place is final only some
+    /// frames later, and people shall not wait for that. Goes into the live segments alone; gives those it completed.
+    ///
+    /// # Errors
+    /// Where a file cannot be written.
+    pub fn log_newest(&mut self, frame_index: u32, time_s: f64, in_world: &[Point3<f64>]) -> Result<Vec<Segment>> {
+        let step = in_world.len().div_ceil(NEWEST_POINTS).max(1);
+        let points = Points3D::update_fields().with_positions(in_world.iter().step_by(step).map(metres));
+        self.store.push_live(&row(entity::NEWEST, Moment { frame: frame_index, time_s }, &points)?)?;
         let cut = self.store.segment_due(&self.budget.segments);
         self.flush(cut, false)?;
         if cut { self.cut() } else { Ok(vec![]) }

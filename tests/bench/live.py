@@ -74,7 +74,7 @@ def newest_profile(path):
     """The newest frame whose profile a segment holds; -1 where it holds none."""
     newest = -1
     for chunk in RrdReader(str(path)).stream():
-        if str(chunk.entity_path).lstrip("/") != "world/surface" or chunk.is_static:
+        if str(chunk.entity_path).lstrip("/") not in ("world/newest", "world/surface") or chunk.is_static:
             continue
         batch = chunk.to_record_batch()
         newest = max(newest, int(np.max(batch.column("frame").to_numpy(zero_copy_only=False))))

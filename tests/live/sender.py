@@ -40,6 +40,7 @@ async def send_all(images, finished):
                 finished.extend([said] if said["type"] in ("closed", "error") else [])
 
         ears = asyncio.create_task(listen())
+        ears.add_done_callback(lambda done: done.cancelled() or done.exception())  # said where it is awaited
         for seq in range(welcome["next_seq"], len(images)):
             await asyncio.sleep(max(0.0, START + seq / float(FPS) - time.time()))
             while seq > state["durable"] + state["credit"] and not ears.done():

@@ -10,14 +10,16 @@ use super::colours::ColourFinder;
 use super::poses::Poses;
 use super::reading::{self, Seen};
 use super::recent::{Recent, RecentFrames};
-use super::{Cargo, Colours, Event, Picture, Products, QualityCounter, Run};
+use super::{Cargo, Colours, Event, Newest, Picture, Products, QualityCounter, Run};
+use nalgebra::Isometry3;
+
 use crate::depth_map::sheet::WallColours;
 use crate::error::{Error, Result};
 use crate::motion::metric::SettledPose;
 use crate::source::{Image, Source};
 use crate::stripe::metric::stripe_stages;
 use crate::surface::{Measured, Placed};
-use crate::triangulation::triangulate;
+use crate::triangulation::{Profile, triangulate};
 
 /// Placed frames that may wait for being written.
 const FRAMES_WAIT: usize = 16;
@@ -28,6 +30,7 @@ const MAX_PICTURES: usize = 12;
 pub(super) fn measure(run: &mut Run<'_, '_, '_, '_>, source: Box<dyn Source>) -> Result<()> {
     let Run { request, products, quality, progress, timings } = run;
     let (rig, recipe) = (&request.rig, &request.recipe);
+    let shows_newest = products.shows_newest();
     let (colours_wanted, between) = (products.wants_colours(), products.wants_wall_colours());
     let mut pictures = products.wants_pictures().then(|| Pictures::new(recipe.recording.images_per_s));
     let mut poses = Poses::new(request)?;
@@ -57,6 +60,12 @@ pub(super) fn measure(run: &mut Run<'_, '_, '_, '_>, source: Box<dyn Source>) ->
             if colours_wanted && let Some(pose) = pose {
                 let earlier = wall.map(|(recent, _)| recent);
                 timings.time("texture", || colours.add(frame.index, rig, &profile, &pose, earlier));
+            }
+            if shows_newest
+                && let Some(pose) = pose
+                && !writer.show(newest_of(frame.index, frame.time_s, &profile, &pose))
+            {
+                break;
             }
             let image = Arc::new(frame.image);
             let picture = pictures.as_mut().and_then(|pictures| pictures.take(frame.time_s, &image, &waiting));
@@ -92,9 +101,22 @@ pub(super) fn measure(run: &mut Run<'_, '_, '_, '_>, source: Box<dyn Source>) ->
     })
 }
 
+/// A profile where its frame's first pose puts it.
+fn newest_of(frame: u32, time_s: f64, profile: &Profile, camera_from_world: &Isometry3<f64>) -> Newest {
+    let world_from_camera = camera_from_world.inverse();
+    let points_in_world = profile.points.iter().map(|point| world_from_camera * point.point_in_camera).collect();
+    Newest { frame, time_s, points_in_world }
+}
+
+/// What the writing thread gets.
+enum Work {
+    Placed(Box<Placed<Cargo>>),
+    Newest(Newest),
+}
+
 /// The thread that adds placed frames to the products.
 struct Writer<'scope> {
-    frames: SyncSender<Placed<Cargo>>,
+    work: SyncSender<Work>,
     events: Receiver<Event>,
     thread: ScopedJoinHandle<'scope, Result<Duration>>,
 }
@@ -105,26 +127,36 @@ impl<'scope> Writer<'scope> {
         products: &'scope mut Products<'r>,
         quality: &'scope mut QualityCounter,
     ) -> Writer<'scope> {
-        let (frames, placed) = sync_channel::<Placed<Cargo>>(FRAMES_WAIT);
+        let (sender, work) = sync_channel::<Work>(FRAMES_WAIT);
         let (say, events) = channel();
         let thread = scope.spawn(move || {
             let mut time = Duration::ZERO;
-            for frame in placed {
+            for one in work {
                 let start = Instant::now();
-                quality.add(&frame, &frame.measured.cargo.stripe);
-                let events = products.add(&frame)?;
+                let events = match one {
+                    Work::Placed(frame) => {
+                        quality.add(&frame, &frame.measured.cargo.stripe);
+                        products.add(&frame)?
+                    }
+                    Work::Newest(newest) => products.show_newest(&newest)?,
+                };
                 time += start.elapsed();
                 // Nobody listens only after a cancel, which has said its own.
                 events.into_iter().for_each(|event| drop(say.send(event)));
             }
             Ok(time)
         });
-        Writer { frames, events, thread }
+        Writer { work: sender, events, thread }
     }
 
     /// Hands frames over; false where the thread has ended, with an error that [`Writer::finish`] tells.
     fn add(&self, placed: Vec<Placed<Cargo>>) -> bool {
-        placed.into_iter().all(|frame| self.frames.send(frame).is_ok())
+        placed.into_iter().all(|frame| self.work.send(Work::Placed(Box::new(frame))).is_ok())
+    }
+
+    /// Hands the newest profile over; false as in [`Writer::add`].
+    fn show(&self, newest: Newest) -> bool {
+        self.work.send(Work::Newest(newest)).is_ok()
     }
 
     /// What there is to say since this was last asked.
@@ -134,7 +166,7 @@ impl<'scope> Writer<'scope> {
 
     /// Waits until all is written: the time that took, and what is left to say.
     fn finish(self) -> Result<(Duration, Vec<Event>)> {
-        drop(self.frames);
+        drop(self.work);
         let time = self.thread.join().map_err(|_| Error::internal("products", "the writing thread panicked"))??;
         Ok((time, self.events.try_iter().collect()))
     }

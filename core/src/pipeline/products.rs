@@ -4,7 +4,7 @@ use std::path::Path;
 
 use super::progress::Progress;
 use super::quality::QualityCounter;
-use super::{Cargo, Colours, Event, ProductGroup, Request, Timings};
+use super::{Cargo, Colours, Event, Newest, ProductGroup, Request, Timings};
 use crate::depth_map::sheet::Sheet;
 use crate::depth_map::strips::{add_strip, strip_grid};
 use crate::depth_map::{FinishedMap, Grid, MapReader, SharedMap, SurfaceMap};
@@ -42,6 +42,8 @@ pub(super) struct Products<'a> {
     recorder: Option<Recorder>,
     archive: Option<ArchiveWriter>,
     live: Option<LiveFrameWriter>,
+    /// The robot still walks.
+    watched: bool,
     frames: u64,
 }
 
@@ -82,6 +84,7 @@ impl<'a> Products<'a> {
             recorder: make(wanted(ProductGroup::Recording), recorder)?,
             archive: make(wanted(ProductGroup::Archive), archive)?,
             live: make(request.live_segments, || LiveFrameWriter::create(folder))?,
+            watched: info.still_open,
             frames: 0,
         })
     }
@@ -95,6 +98,18 @@ impl<'a> Products<'a> {
     /// Whether the frames themselves are shown anywhere.
     pub(super) fn wants_pictures(&self) -> bool {
         self.recorder.is_some() || self.live.is_some()
+    }
+
+    /// Whether the newest profile is shown before its place is final: the robot still walks, and people watch.
+    pub(super) fn shows_newest(&self) -> bool {
+        self.watched && self.recorder.is_some()
+    }
+
+    /// Shows the newest profile; says what can be shown now.
+    pub(super) fn show_newest(&mut self, newest: &Newest) -> Result<Vec<Event>> {
+        let Some(recorder) = &mut self.recorder else { return Ok(Vec::new()) };
+        let segments = recorder.log_newest(newest.frame, newest.time_s, &newest.points_in_world)?;
+        Ok(self.announcements(segments))
     }
 
     /// Whether any product shows the wall's colours.

@@ -88,6 +88,17 @@ impl RrdStore {
         Ok(())
     }
 
+    /// Adds a chunk to the current live segment alone: what is of the moment and not of the record.
+    pub(super) fn push_live(&mut self, chunk: &Chunk) -> Result<()> {
+        match &mut self.live {
+            Some(live) => {
+                live.push(message(&self.id, chunk)?, chunk.total_size_bytes());
+                Ok(())
+            }
+            None => Ok(()),
+        }
+    }
+
     /// Writes chunks of one entity as one, or as few as their columns allow.
     fn write_joined(&mut self, waiting: Waiting) -> Result<()> {
         let mut chunks = waiting.chunks;
