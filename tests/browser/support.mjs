@@ -2,8 +2,9 @@
 
 import assert from "node:assert/strict";
 import { execFile, spawn } from "node:child_process";
-import { existsSync } from "node:fs";
+import { existsSync, readFileSync } from "node:fs";
 import { mkdtemp, readFile, rm, writeFile } from "node:fs/promises";
+import { createRequire } from "node:module";
 import { createServer } from "node:net";
 import { tmpdir } from "node:os";
 import path from "node:path";
@@ -22,11 +23,11 @@ const pictures = process.env.STRIA_PICTURES ?? path.join(repository, "target/bro
 const READY_MS = 20_000;
 
 /** Starts `stria serve` on a free port with an empty data folder; `stop` ends it and checks that it was still well. */
-export async function startServer() {
+export async function startServer(flags = []) {
   need(stria, "run `make build`, or set STRIA_BIN");
   const folder = await mkdtemp(path.join(tmpdir(), "stria-browser-"));
   const url = `http://127.0.0.1:${await freePort()}`;
-  const child = spawn(stria, ["serve", "--listen", new URL(url).host, "--data", path.join(folder, "data")], { stdio: ["ignore", "pipe", "pipe"] });
+  const child = spawn(stria, ["serve", "--listen", new URL(url).host, "--data", path.join(folder, "data"), ...flags], { stdio: ["ignore", "pipe", "pipe"] });
   let said = "";
   for (const stream of [child.stdout, child.stderr]) stream.on("data", (bytes) => (said += bytes));
   const ended = new Promise((done) => child.once("exit", (code, signal) => done(signal ?? code)));
@@ -49,15 +50,16 @@ export async function startServer() {
 }
 
 /** Makes a realistic run in a new folder: its video, its rig. `remove` takes the folder away. */
-export async function simulate({ seconds = 2, size = "640x360", seed = 1 } = {}) {
+export async function simulate({ scene = "pipe", seconds = 2, size = "640x360", seed = 1 } = {}) {
   need(stria, "run `make build`, or set STRIA_BIN");
   const folder = await mkdtemp(path.join(tmpdir(), "stria-run-"));
   const out = path.join(folder, "run");
-  await promisify(execFile)(stria, ["simulate", "pipe", "--out", out, "--seconds", `${seconds}`, "--size", size, "--seed", `${seed}`]);
+  await promisify(execFile)(stria, ["simulate", scene, "--out", out, "--seconds", `${seconds}`, "--size", size, "--seed", `${seed}`]);
   return {
     folder,
     video: path.join(out, "video.mp4"),
     rig: path.join(out, "rig.toml"),
+    truth: path.join(out, "truth"),
     remove: () => rm(folder, { recursive: true, force: true }),
   };
 }
@@ -76,8 +78,10 @@ export async function rigForOtherSize(rig, folder) {
 export async function startBrowser() {
   need(chromiumPath, "run `make setup`, which installs Chromium, or set CHROMIUM_BIN");
   const quiet = ["--disable-quic", "--no-first-run", "--disable-background-networking", "--disable-component-update", "--disable-sync"];
+  // A test looks at the memory of a tab, and at the clock: nothing may slow a page because nobody sees it.
+  const awake = ["--disable-background-timer-throttling", "--disable-renderer-backgrounding", "--disable-backgrounding-occluded-windows"];
   const webgl = ["--use-gl=angle", "--use-angle=swiftshader", "--enable-unsafe-swiftshader"];
-  return chromium.launch({ executablePath: chromiumPath, args: ["--no-sandbox", ...quiet, ...webgl] });
+  return chromium.launch({ executablePath: chromiumPath, args: ["--no-sandbox", ...quiet, ...awake, ...webgl] });
 }
 
 /**
@@ -119,6 +123,84 @@ export async function getJson(server, address) {
   const response = await fetch(new URL(address, server.url));
   assert.ok(response.ok, `${address}: HTTP ${response.status}`);
   return response.json();
+}
+
+/** Sends a run past the browser, in one request; answers it as the server shows it. */
+export async function sendRun(server, run, fields = {}) {
+  const form = new FormData();
+  for (const [name, value] of Object.entries({ asset: "test wall", rig: await readFile(run.rig, "utf8"), ...fields })) form.append(name, value);
+  form.append("file", new Blob([await readFile(run.video)]), fields.filename ?? path.basename(run.video));
+  const response = await fetch(new URL("/api/runs", server.url), { method: "POST", body: form });
+  assert.equal(response.status, 201, await response.clone().text());
+  return response.json();
+}
+
+/** Waits for a job's end; answers the job. */
+export async function jobEnds(server, job, state = "done") {
+  const ended = await until(`job ${job} ends`, 180_000, async () => {
+    const now = await getJson(server, `/api/jobs/${job}`);
+    return !["queued", "running"].includes(now.state) && now;
+  });
+  assert.equal(ended.state, state, JSON.stringify(ended.error));
+  return ended;
+}
+
+/** A finished run. */
+export async function measuredRun(server, run, fields = {}) {
+  const sent = await sendRun(server, run, fields);
+  await jobEnds(server, sent.job.id);
+  return getJson(server, `/api/runs/${sent.id}`);
+}
+
+/** From now on the page has the link of a site: 2 Mbit/s, 150 ms from end to end and back. */
+export async function thinLink(page) {
+  const session = await page.context().newCDPSession(page);
+  await session.send("Network.enable");
+  const bytesPerS = 2_000_000 / 8;
+  await session.send("Network.emulateNetworkConditions", { offline: false, latency: 150, downloadThroughput: bytesPerS, uploadThroughput: bytesPerS });
+  return session;
+}
+
+const axe = readFileSync(createRequire(import.meta.url).resolve("axe-core/axe.min.js"), "utf8");
+
+/** What axe-core finds serious or critical on the page as it is. */
+export async function seriousViolations(page) {
+  await page.evaluate(axe); // past the content security policy, as the developer tools are
+  const { violations } = await page.evaluate(() => globalThis.axe.run(document, { resultTypes: ["violations"] }));
+  return violations
+    .filter(({ impact }) => impact === "serious" || impact === "critical")
+    .map(({ id, help, nodes }) => `${id}: ${help}: ${nodes.map(({ html }) => html.slice(0, 160)).join(" | ")}`);
+}
+
+/** The answer of one of the readers in tests/readers, which take files that we wrote apart with programs that we did not. */
+export async function readWith(script, ...files) {
+  const python = path.join(repository, "target/python/bin/python");
+  need(python, "run `make setup`");
+  const { stdout } = await promisify(execFile)(python, [path.join(repository, "tests/readers", script), ...files], { maxBuffer: 1 << 28 });
+  return JSON.parse(stdout);
+}
+
+/** A product of a job in a file. */
+export async function fetchProduct(server, job, name, folder) {
+  const response = await fetch(new URL(`/api/jobs/${job}/products/${name}`, server.url));
+  assert.ok(response.ok, `${name}: HTTP ${response.status}`);
+  const file = path.join(folder, name);
+  await writeFile(file, Buffer.from(await response.arrayBuffer()));
+  return file;
+}
+
+/** The map on the page shows all that is in view, sharp. */
+export async function mapSettled(page, within = page) {
+  await within.locator(".map-top[data-ready]").first().waitFor();
+  await within.locator(".map-loading[data-settled=true]").first().waitFor({ state: "attached", timeout: 60_000 });
+}
+
+/** Where a place of the world is on the page, and the other way round: from the map's own view. */
+export async function onPage(page, x_mm, y_mm) {
+  const map = page.locator(".map-top").first();
+  const box = await map.boundingBox();
+  const view = await map.evaluate((element) => element.striaMap.view);
+  return { x: box.x + box.width / 2 + (x_mm - view.x_mm) / view.mm_per_css_px, y: box.y + box.height / 2 + (y_mm - view.y_mm) / view.mm_per_css_px };
 }
 
 /** Lets files go over an element, as a person who drags them from a file manager. */

@@ -1,16 +1,23 @@
-// A person sends runs through the page and gets at their results.
+// A person sends runs through the page: several files, paused, cut off, gone on with after a reload.
 
 import assert from "node:assert/strict";
 import { createHash } from "node:crypto";
-import { readFile } from "node:fs/promises";
+import { readFile, writeFile } from "node:fs/promises";
+import path from "node:path";
 import { after, before, test } from "node:test";
-import { dropFiles, getJson, keepPicture, openPage, simulate, startBrowser, startServer, until } from "./support.mjs";
+import { dropFiles, getJson, jobEnds, keepPicture, openPage, simulate, startBrowser, startServer, thinLink, until } from "./support.mjs";
 
 const DONE_MS = 120_000;
-let server, browser, run;
+/** Large enough to be stopped on its way: half a minute on the link of a site. */
+const BIG_BYTES = 8_000_000;
+let server, browser, run, big;
 
 before(async () => {
   [server, run, browser] = await Promise.all([startServer(), simulate({ seconds: 4 }), startBrowser()]);
+  // A good video with something behind its end: FFmpeg does not mind, and the file is large.
+  big = path.join(run.folder, "big.mp4");
+  const video = await readFile(run.video);
+  await writeFile(big, Buffer.concat([video, freeBox(BIG_BYTES - video.length)]));
 });
 after(async () => {
   await browser?.close();
@@ -18,36 +25,56 @@ after(async () => {
   await server?.stop();
 });
 
-test("files chosen with the button: progress is seen, the result is shown, every file can be downloaded", async () => {
+/** MP4's own way to say "nothing": a box that readers skip. */
+function freeBox(bytes) {
+  const box = Buffer.alloc(bytes, 7);
+  box.writeUInt32BE(bytes, 0);
+  box.write("free", 4, "latin1");
+  return box;
+}
+
+async function choose(page, files, asset) {
+  await page.goto("/send");
+  await page.getByLabel("Choose files").setInputFiles(files);
+  await page.getByLabel("Asset").fill(asset);
+  await page.getByRole("button", { name: /^Send/ }).last().click();
+}
+
+const item = (page, name) => page.locator(".upload-item", { hasText: name });
+const sentBytes = async (page, name) => Number(await item(page, name).getByRole("progressbar").getAttribute("value"));
+
+/** The run that the server made of a file, once it has. */
+async function arrived(asset, count = 1) {
+  return until(`${count} of ${asset} arrived`, 60_000, async () => {
+    const { items } = await getJson(server, `/api/runs?asset=${encodeURIComponent(asset)}`);
+    return items.length === count && items;
+  });
+}
+
+async function sameSource(entry, file) {
+  const source = Buffer.from(await (await fetch(new URL(entry.source.url, server.url))).arrayBuffer());
+  assert.deepEqual(createHash("sha256").update(source).digest("hex"), createHash("sha256").update(await readFile(file)).digest("hex"));
+}
+
+test("files chosen with the button: sent, measured, shown, every file downloaded", async () => {
   const { page, close } = await openPage(browser, server);
   await page.goto("/");
   await page.getByText("No runs yet").waitFor();
+  await page.getByRole("navigation", { name: "Main" }).getByRole("link", { name: "Send a run" }).click();
   await page.getByLabel("Choose files").setInputFiles([run.video, run.rig]);
   await page.getByLabel("Asset").fill("sewer 12, north");
+  await page.getByLabel("Starts at, mm").fill("2500");
+  await page.getByLabel("Direction").selectOption("backward");
   await page.getByRole("button", { name: "Send the run" }).click();
-
-  await page.waitForURL(/\/runs\/[^/]+$/);
-  const seen = new Set();
-  await until("the run is done", DONE_MS, async () => {
-    const bar = page.getByRole("progressbar", { name: "Progress of the measurement" });
-    const value = await bar.getAttribute("value", { timeout: 100 }).catch(() => null);
-    if (value !== null) seen.add(Number(value));
-    return page.getByRole("heading", { name: "Files to download" }).isVisible();
-  });
-  assert.ok([...seen].some((value) => value > 0 && value < 1), `progress moved on: ${[...seen]}`);
-
-  const preview = page.getByRole("img", { name: "depth picture of sewer 12, north" });
-  await until("the preview has been loaded", 10_000, () => preview.evaluate((image) => image.complete && image.naturalWidth > 100));
-  await page.getByText("The laser line was found at").waitFor();
-  await page.getByText("The robot travelled").waitFor();
-  await keepPicture(page, "run-done");
-
-  const job = (await getJson(server, `/api/runs/${new URL(page.url()).pathname.split("/").at(-1)}`)).job.id;
-  const products = (await getJson(server, `/api/jobs/${job}/products`)).items.filter(({ name }) => !name.includes("/"));
+  await page.getByRole("link", { name: "Show the run" }).click();
+  await page.getByRole("tab", { name: "Files" }).click({ timeout: DONE_MS });
+  const [entry] = await arrived("sewer 12, north");
+  assert.deepEqual([entry.chainage_mm, entry.direction], [2500, "backward"]);
+  const products = (await getJson(server, `/api/jobs/${entry.job.id}/products`)).items.filter(({ name }) => !name.includes("/"));
   assert.ok(products.length >= 8, `products: ${products.map(({ name }) => name)}`);
   for (const { name, bytes, sha256 } of products) {
     const waiting = page.waitForEvent("download");
-    await page.getByRole("link", { name: `Download ${name}` }).click();
+    await page.getByRole("link", { name: `Download ${name}`, exact: true }).click();
     const download = await waiting;
     const content = await readFile(await download.path());
     assert.equal(content.length, bytes, name);
@@ -57,22 +84,20 @@ test("files chosen with the button: progress is seen, the result is shown, every
   await close();
 });
 
-test("files dropped on the page; the run shows in the list and can be deleted", async () => {
+test("files dropped on the list go to the page for sending; the run shows in the list and can be deleted", async () => {
   const { page, close } = await openPage(browser, server);
   await page.goto("/");
-  await dropFiles(page, page.locator(".drop"), [run.video, run.rig]);
+  await dropFiles(page, page.locator("body"), [run.video, run.rig]);
   await page.getByLabel("Asset").fill("dropped wall");
   await page.getByRole("button", { name: "Send the run" }).click();
-  await page.waitForURL(/\/runs\//);
-  await page.getByRole("heading", { name: "Files to download" }).waitFor({ timeout: DONE_MS });
-
+  const [entry] = await arrived("dropped wall");
+  await jobEnds(server, entry.job.id);
   await page.getByRole("navigation", { name: "Main" }).getByRole("link", { name: "Runs" }).click();
   const row = page.getByRole("listitem").filter({ hasText: "dropped wall" });
   await row.getByText("Done").waitFor();
   const thumbnail = row.getByRole("img");
   await until("the list's picture has been loaded", 10_000, () => thumbnail.evaluate((image) => image.complete && image.naturalWidth > 0));
   await row.getByRole("link").click();
-
   await page.getByRole("button", { name: "Delete this run" }).click();
   await page.getByRole("button", { name: "Keep it" }).click();
   await page.getByRole("button", { name: "Delete this run" }).click();
@@ -82,36 +107,84 @@ test("files dropped on the page; the run shows in the list and can be deleted", 
   await close();
 });
 
-test("several videos go one after the other", async () => {
+test("several videos go one after the other, beside other pages", async () => {
   const { page, close } = await openPage(browser, server);
-  await page.goto("/");
+  const second = { name: "second.mp4", mimeType: "video/mp4", buffer: await readFile(run.video) };
+  await page.goto("/send");
   await page.getByLabel("Choose files").setInputFiles([run.video, run.rig]);
-  await page.getByLabel("Choose files").setInputFiles([
-    { name: "second.mp4", mimeType: "video/mp4", buffer: await readFile(run.video) },
-  ]);
+  await page.getByLabel("Choose files").setInputFiles([second]);
   await page.getByLabel("Asset").fill("two at once");
   await page.getByRole("button", { name: "Send 2 runs" }).click();
-  await page.getByText("second.mp4 has arrived").waitFor();
-  await until("both are in the list", 10_000, async () => (await page.getByRole("listitem").filter({ hasText: "two at once" }).count()) === 2);
+  await page.getByRole("navigation", { name: "Main" }).getByRole("link", { name: "Queue" }).click();
+  await arrived("two at once", 2);
+  await page.getByRole("link", { name: "Send a run" }).click();
+  await item(page, "second.mp4").getByText("Has arrived").waitFor();
+  await close();
+});
+
+test("paused, gone on with, cut off, and whole in the end", async () => {
+  const { page, context, close } = await openPage(browser, server);
+  const link = await thinLink(page);
+  await choose(page, [big, run.rig], "a large one");
+  await until("it is on its way", 20_000, async () => (await sentBytes(page, "big.mp4")) > 500_000);
+  await item(page, "big.mp4").getByText(/left/).waitFor();
+  await keepPicture(page, "sending");
+  await item(page, "big.mp4").getByRole("button", { name: /^Pause/ }).click();
+  await item(page, "big.mp4").getByText("Paused").waitFor();
+  const paused = await sentBytes(page, "big.mp4");
+  await item(page, "big.mp4").getByRole("button", { name: /^Go on/ }).click();
+  await until("it goes on from there", 20_000, async () => (await sentBytes(page, "big.mp4")) > paused + 200_000);
+  await context.setOffline(true);
+  await item(page, "big.mp4").getByText("The link is down").waitFor({ timeout: 20_000 });
+  const cut = await sentBytes(page, "big.mp4");
+  assert.ok(cut >= paused, "nothing that arrived is lost");
+  await link.send("Network.emulateNetworkConditions", { offline: false, latency: 0, downloadThroughput: -1, uploadThroughput: -1 });
+  await context.setOffline(false);
+  const [entry] = await arrived("a large one");
+  await sameSource(entry, big);
+  await jobEnds(server, entry.job.id);
+  await close();
+});
+
+test("a reload in the middle: the same file again goes on where it stopped", async () => {
+  const { page, close } = await openPage(browser, server);
+  const link = await thinLink(page);
+  await choose(page, [big, run.rig], "after a reload");
+  await until("half a megabyte is there", 20_000, async () => (await sentBytes(page, "big.mp4")) > 500_000);
+  page.on("dialog", (dialog) => dialog.accept()); // "leave the page?"
+  await page.reload();
+  await item(page, "big.mp4").getByText("Was interrupted").waitFor();
+  const offsets = [];
+  page.on("request", (request) => request.method() === "PATCH" && offsets.push(Number(request.headers()["upload-offset"])));
+  await link.send("Network.emulateNetworkConditions", { offline: false, latency: 0, downloadThroughput: -1, uploadThroughput: -1 });
+  await page.getByLabel("Choose files").setInputFiles([big]);
+  const [entry] = await arrived("after a reload");
+  assert.ok(offsets[0] > 100_000, `it went on at ${offsets[0]}`);
+  await sameSource(entry, big);
   await close();
 });
 
 test("from the empty form to the result by keyboard alone", async () => {
   const { page, close } = await openPage(browser, server);
-  await page.goto("/");
+  await page.goto("/send");
   await tabTo(page, "Choose files");
   const chooser = page.waitForEvent("filechooser");
   await page.keyboard.press("Space");
   await (await chooser).setFiles([run.video, run.rig]);
+  await page.getByRole("button", { name: "Send the run" }).waitFor();
   await tabTo(page, "Send the run");
   await page.keyboard.press("Enter");
   await page.getByText("Say which asset this is.").waitFor();
   await until("the keyboard stands in the field that is missing", 2000, async () => (await focusedName(page)) === "Asset");
   await page.keyboard.type("by keyboard");
   await page.keyboard.press("Enter");
-
-  await page.waitForURL(/\/runs\//);
-  await page.getByRole("heading", { name: "Files to download" }).waitFor({ timeout: DONE_MS });
+  await page.getByRole("link", { name: "Show the run" }).waitFor();
+  await tabTo(page, "Show the run");
+  await page.keyboard.press("Enter");
+  await page.getByRole("tab", { name: "Files" }).waitFor({ timeout: DONE_MS });
+  await tabTo(page, "Files");
+  await page.keyboard.press("Enter");
+  await page.getByRole("link", { name: "Download depth.tif" }).waitFor();
   await tabTo(page, "Download depth.tif");
   const download = page.waitForEvent("download");
   await page.keyboard.press("Enter");

@@ -9,7 +9,7 @@ import { after, before, test } from "node:test";
 import { setTimeout as sleep } from "node:timers/promises";
 import { fileURLToPath } from "node:url";
 import { promisify } from "node:util";
-import { getJson, keepPicture, openPage, simulate, startBrowser, startServer, until } from "./support.mjs";
+import { getJson, jobEnds, keepPicture, openPage, sendRun, simulate, startBrowser, startServer, until } from "./support.mjs";
 
 const rerun = path.resolve(path.dirname(fileURLToPath(import.meta.url)), "../../target/python/bin/rerun");
 const DONE_MS = 120_000;
@@ -32,15 +32,15 @@ after(async () => {
 test("a finished run: the surface is on the canvas, and its pixels are the surface's", async () => {
   const run = await simulate();
   const { page, close } = await openPage(browser, server);
-  await send(page, run);
-  await page.getByRole("heading", { name: "Files to download" }).waitFor({ timeout: DONE_MS });
+  await jobEnds(server, (await send(page, run)).job.id);
+  await page.getByRole("tab", { name: "Files" }).waitFor({ timeout: DONE_MS });
   const address = page.url();
   assert.equal(await page.locator("canvas").count(), 0, "nothing of the viewer is there before it is asked for");
 
   await page.getByRole("button", { name: "Open 3D view" }).click();
   await page.getByText("The whole recording is shown").waitFor({ timeout: SHOWN_MS });
   const withSurface = await settledShare(page);
-  await keepPicture(page.locator(".view"), "view3d");
+  await keepPicture(page.locator(".view").first(), "view3d");
 
   // The same recording without the surface's points must look different just there.
   const { items } = await getJson(server, `/api/runs?limit=1`);
@@ -53,7 +53,7 @@ test("a finished run: the surface is on the canvas, and its pixels are the surfa
   await page.getByRole("button", { name: "Open 3D view" }).click();
   await page.getByText("The whole recording is shown").waitFor({ timeout: SHOWN_MS });
   const bareShare = await settledShare(page);
-  await keepPicture(page.locator(".view"), "view3d-without-surface");
+  await keepPicture(page.locator(".view").first(), "view3d-without-surface");
 
   const shares = `coloured share of the 3D view: ${withSurface.toFixed(4)} with the surface, ${bareShare.toFixed(4)} without`;
   assert.ok(withSurface > SURFACE_SHARE, shares);
@@ -65,8 +65,6 @@ test("a finished run: the surface is on the canvas, and its pixels are the surfa
 test("a run that is being measured: the surface is on the canvas before the job has ended", async () => {
   const run = await simulate({ seconds: 90 });
   const { page, close } = await openPage(browser, server);
-  // The viewer is in the browser's cache and compiled when the job starts, as for anyone who watches a second run.
-  await page.goto("/");
   await send(page, run);
   await page.getByRole("button", { name: "Open 3D view" }).click();
   await page.getByText(/^Live: \d+ parts? received/).waitFor({ timeout: SHOWN_MS });
@@ -77,7 +75,7 @@ test("a run that is being measured: the surface is on the canvas before the job 
     return now > SURFACE_SHARE / 4 && now;
   });
   assert.ok(share > 0);
-  await keepPicture(page.locator(".view"), "view3d-live");
+  await keepPicture(page.locator(".view").first(), "view3d-live");
   await page.getByText("The whole recording is shown").waitFor({ timeout: DONE_MS });
   await run.remove();
   await close();
@@ -86,8 +84,8 @@ test("a run that is being measured: the surface is on the canvas before the job 
 test("the keyboard gets out of the 3D view, and it closes and opens again", async () => {
   const run = await simulate();
   const { page, close } = await openPage(browser, server);
-  await send(page, run);
-  await page.getByRole("heading", { name: "Files to download" }).waitFor({ timeout: DONE_MS });
+  await jobEnds(server, (await send(page, run)).job.id);
+  await page.getByRole("tab", { name: "Files" }).waitFor({ timeout: DONE_MS });
   for (let round = 0; round < 2; round += 1) {
     await page.getByRole("button", { name: "Open 3D view" }).click();
     await page.getByText("The whole recording is shown").waitFor({ timeout: SHOWN_MS });
@@ -101,12 +99,11 @@ test("the keyboard gets out of the 3D view, and it closes and opens again", asyn
   await close();
 });
 
+/** Sends a run and opens its 3D part. */
 async function send(page, run) {
-  await page.goto("/");
-  await page.getByLabel("Choose files").setInputFiles([run.video, run.rig]);
-  await page.getByLabel("Asset").fill("seen in 3D");
-  await page.getByRole("button", { name: "Send the run" }).click();
-  await page.waitForURL(/\/runs\//);
+  const sent = await sendRun(server, run, { asset: "seen in 3D" });
+  await page.goto(`/runs/${sent.id}?tab=space`);
+  return sent;
 }
 
 /** The job's recording with the surface's points taken out, by rerun's own tool. */
@@ -152,3 +149,37 @@ async function colouredShare(page) {
     return coloured / (width * height);
   }, picture);
 }
+
+test("the light view draws the surface, turns it, and needs no viewer", async () => {
+  const run = await simulate({ scene: "wall" });
+  const { page, close } = await openPage(browser, server);
+  await jobEnds(server, (await send(page, run)).job.id);
+  const asked = [];
+  page.on("request", (request) => asked.push(request.url()));
+  await page.getByRole("tab", { name: "Files" }).waitFor({ timeout: DONE_MS });
+  await page.getByRole("button", { name: "Open light view" }).click();
+  await page.getByText(/[\d,]+ points/).waitFor();
+  const drawn = () =>
+    page.locator(".view.light canvas").evaluate((canvas) => {
+      const gl = canvas.getContext("webgl");
+      const pixels = new Uint8Array(4 * canvas.width * canvas.height);
+      gl.readPixels(0, 0, canvas.width, canvas.height, gl.RGBA, gl.UNSIGNED_BYTE, pixels);
+      let [count, sum] = [0, 0];
+      for (let at = 0; at < pixels.length; at += 4) {
+        if (pixels[at + 3] === 0) continue;
+        count += 1;
+        sum = (sum * 31 + pixels[at] + 7 * pixels[at + 1] + at) % 1_000_003;
+      }
+      return { share: count / (pixels.length / 4), sum };
+    });
+  const first = await until("points are drawn", 10_000, async () => {
+    const now = await drawn();
+    return now.share > 0.1 && now;
+  });
+  await keepPicture(page.locator(".view.light"), "light-view");
+  await page.locator(".view.light canvas").press("ArrowLeft");
+  await until("it turns", 5000, async () => (await drawn()).sum !== first.sum);
+  assert.ok(asked.every((url) => !url.includes("/viewer/")), "nothing of the viewer was loaded");
+  await run.remove();
+  await close();
+});

@@ -1,6 +1,7 @@
 // Everything the pages ask of the server. The only file that fetches; shapes come from the OpenAPI document.
 
 import type { components } from "./api.gen.ts";
+import type { TilesIndex } from "./map/pyramid.ts";
 
 type Schemas = components["schemas"];
 export type Run = Schemas["Run"];
@@ -14,10 +15,17 @@ export type Recording = Schemas["Recording"];
 export type RecordingSegment = Schemas["RecordingSegment"];
 export type Rig = Schemas["Rig"];
 export type Recipe = Schemas["Recipe"];
+export type RecipeOption = Schemas["RecipeOption"];
+export type Asset = Schemas["Asset"];
+export type Worker = Schemas["Worker"];
+export type LiveStream = Schemas["LiveStream"];
 export type Problem = Schemas["Problem"];
+export type CrossSection = Schemas["CrossSection"];
+export type Trajectory = Schemas["Trajectory"];
 
 /** What we read of a job's `manifest.json`. A file of the product folder, not a shape of the HTTP interface. */
 export interface Manifest {
+  recipe: Record<string, unknown>;
   quality: {
     frames: number;
     frames_with_stripe: number;
@@ -49,7 +57,8 @@ export function problemOf(error: unknown): Problem {
   return { type: "about:blank", title: "Unexpected error", detail: error instanceof Error ? error.message : String(error), retryable: false };
 }
 
-function problemIn(status: number, body: string): Problem {
+/** The problem in an answer that tells of no success. */
+export function problemIn(status: number, body: string): Problem {
   try {
     const problem = JSON.parse(body) as Partial<Problem>;
     if (typeof problem.title === "string" && typeof problem.detail === "string") return problem as Problem;
@@ -69,6 +78,8 @@ async function request(path: string, init?: RequestInit): Promise<Response> {
     throw new ApiError(UNREACHABLE);
   }
   if (response.ok) return response;
+  // Nobody is logged in, or not any more: the server's own page asks who it is, and comes back here.
+  if (response.status === 401) location.assign(`/login?next=${encodeURIComponent(location.pathname + location.search)}`);
   throw new ApiError(problemIn(response.status, await response.text().catch(() => "")));
 }
 
@@ -90,9 +101,103 @@ function creating(body?: unknown): RequestInit {
 
 const at = encodeURIComponent;
 
-/** Runs from the newest on; `cursor` is null for the first page. */
-export const listRuns = (cursor: string | null, limit: number): Promise<RunPage> =>
-  json(`/api/runs?limit=${limit}${cursor === null ? "" : `&cursor=${at(cursor)}`}`);
+/** Which runs to list, in which order; what is empty does not matter. */
+export interface RunFilter {
+  q: string;
+  state: string;
+  asset: string;
+  from: string;
+  to: string;
+  sort: string;
+}
+
+/** A page of runs; `cursor` is null for the first. */
+export function listRuns(filter: RunFilter, cursor: string | null, limit: number, signal?: AbortSignal): Promise<RunPage> {
+  const query = new URLSearchParams({ limit: `${limit}` });
+  for (const [name, value] of Object.entries(filter)) if (value !== "") query.set(name, value as string);
+  if (cursor !== null) query.set("cursor", cursor);
+  return json(`/api/runs?${query}`, signal ? { signal } : undefined);
+}
+
+/** Every asset, by name; more than a page of them is rare. */
+export async function listAssets(): Promise<Asset[]> {
+  const assets: Asset[] = [];
+  let cursor: string | null | undefined = null;
+  do {
+    const page: Schemas["AssetPage"] = await json(`/api/assets?limit=1000${cursor ? `&cursor=${at(cursor)}` : ""}`);
+    assets.push(...page.items);
+    cursor = page.next_cursor;
+  } while (cursor);
+  return assets;
+}
+
+/** The first jobs of a state, the newest first. */
+export const listJobsIn = (state: JobState, limit: number): Promise<JobPage> => json(`/api/jobs?state=${state}&limit=${limit}`);
+export const getJob = (job: string): Promise<Job> => json(`/api/jobs/${at(job)}`);
+export const listWorkers = (): Promise<Worker[]> => json("/api/workers");
+export const listOptions = (): Promise<RecipeOption[]> => json("/api/options");
+export const createRig = (toml: string): Promise<Rig> =>
+  json("/api/rigs", { method: "POST", headers: { "idempotency-key": newKey(), "content-type": "application/toml" }, body: toml });
+
+/** What can be changed about a run. */
+export const changeRun = (run: string, change: Schemas["RunChange"]): Promise<Run> =>
+  json(`/api/runs/${at(run)}`, { method: "PATCH", headers: { "content-type": "application/json" }, body: JSON.stringify(change) });
+
+/** Where to cut the wall open, mm in the world; `across`: at one chainage, through the whole map. */
+export interface Cut {
+  from_mm: [number, number];
+  to_mm: [number, number];
+  across?: boolean;
+}
+
+/** The address of a cross-section. */
+export function profilePath(job: string, cut: Cut, format?: "csv"): string {
+  const query = new URLSearchParams({ from: cut.from_mm.map((mm) => mm.toFixed(3)).join(), to: cut.to_mm.map((mm) => mm.toFixed(3)).join() });
+  if (format !== undefined) query.set("format", format);
+  return `/api/jobs/${at(job)}/profile?${query}`;
+}
+export const getProfile = (job: string, cut: Cut, signal: AbortSignal): Promise<CrossSection> => json(profilePath(job, cut), { signal });
+export const getTrajectory = (job: string): Promise<Trajectory> => json(`/api/jobs/${at(job)}/trajectory`);
+
+/** Where a job's tiles are, also while it runs. */
+export const tilesFolder = (job: string): string => `/api/jobs/${at(job)}/tiles`;
+
+/** What tiles a job has; null where there are none (yet). */
+export async function getTilesIndex(job: string): Promise<TilesIndex | null> {
+  try {
+    return await json<TilesIndex>(`${tilesFolder(job)}/tiles.json`, { cache: "no-cache" });
+  } catch (error) {
+    if (error instanceof ApiError && error.problem.status === 404) return null;
+    throw error;
+  }
+}
+
+/** The streams of robots that walk now, or did lately. */
+export const listStreams = async (): Promise<LiveStream[]> => (await json<Schemas["LiveStreams"]>("/api/live")).items;
+
+/** The newest frame of a job that runs: the stripe found in it, as `core/src/export/live_frame.rs` writes it. */
+export interface LiveFrame {
+  frame: number;
+  time_s: number;
+  width_px: number;
+  height_px: number;
+  spots_px: [number, number][];
+  rows_found: number;
+  rows: number;
+  x_mm: number | null;
+}
+
+/** The newest frame and its picture; null where there is none. */
+export async function getLiveFrame(job: string): Promise<{ about: LiveFrame; picture: Blob } | null> {
+  const folder = `/api/jobs/${at(job)}/live`;
+  try {
+    const picture = await (await request(`${folder}/frame.jpg`, { cache: "no-cache" })).blob();
+    return { about: await json<LiveFrame>(`${folder}/frame.json`, { cache: "no-cache" }), picture };
+  } catch (error) {
+    if (error instanceof ApiError && error.problem.status === 404) return null;
+    throw error;
+  }
+}
 export const getRun = (run: string): Promise<Run> => json(`/api/runs/${at(run)}`);
 export const deleteRun = (run: string): Promise<Response> => request(`/api/runs/${at(run)}`, { method: "DELETE" });
 
@@ -100,7 +205,7 @@ export const deleteRun = (run: string): Promise<Response> => request(`/api/runs/
 export const listJobs = async (run: string): Promise<Job[]> => (await json<JobPage>(`/api/jobs?run=${at(run)}`)).items;
 
 /** A new job for a run; what is left out stays as in its latest job. */
-export const reprocess = (run: string, change: { recipe?: string; rig?: string }): Promise<Job> =>
+export const reprocess = (run: string, change: Schemas["Reprocess"]): Promise<Job> =>
   json(`/api/runs/${at(run)}/jobs`, creating(change));
 export const cancelJob = (job: string): Promise<Response> => request(`/api/jobs/${at(job)}/cancel`, creating());
 export const retryJob = (job: string): Promise<Response> => request(`/api/jobs/${at(job)}/retry`, creating());
@@ -148,45 +253,6 @@ export function productPath(job: string, name: string): string {
   return `/api/jobs/${at(job)}/products/${name.split("/").map(at).join("/")}`;
 }
 
-/** A run to be sent. */
-export interface Upload {
-  video: File;
-  /** A stored rig's name, or a rig file. */
-  rig: string | File;
-  asset: string;
-  recipe: string;
-}
-
-/**
- * Sends one run in one request. `progress` hears the bytes sent so far, of all; fetch cannot tell that, XMLHttpRequest
- * can. Aborting the signal stops the sending.
- */
-export function sendRun(upload: Upload, progress: (sent: number, all: number) => void, signal: AbortSignal): Promise<Run> {
-  const form = new FormData();
-  // Small fields first: the server can refuse a bad one before the video has been sent.
-  form.append("asset", upload.asset);
-  form.append("recipe", upload.recipe);
-  if (typeof upload.rig === "string") form.append("rig", upload.rig);
-  else form.append("rig", upload.rig, upload.rig.name);
-  // Browsers write a quote in a part's own file name as %22; a field of its own keeps the name as it is.
-  form.append("filename", upload.video.name);
-  form.append("file", upload.video, upload.video.name);
-  return new Promise((done, failed) => {
-    const request = new XMLHttpRequest();
-    request.open("POST", "/api/runs");
-    request.setRequestHeader("idempotency-key", newKey());
-    request.upload.onprogress = (event) => progress(event.loaded, event.total);
-    request.onload = () => {
-      if (request.status >= 200 && request.status < 300) done(JSON.parse(request.responseText) as Run);
-      else failed(new ApiError(problemIn(request.status, request.responseText)));
-    };
-    request.onerror = () => failed(new ApiError(UNREACHABLE));
-    request.onabort = () => failed(new DOMException("stopped", "AbortError"));
-    signal.addEventListener("abort", () => request.abort());
-    request.send(form);
-  });
-}
-
 /** True while something may still happen to a job by itself. */
 export function isActive({ state }: { state: JobState }): boolean {
   return state === "queued" || state === "running";
@@ -198,6 +264,8 @@ export interface JobListener {
   job(job: Job): void;
   /** A recording segment may be fetched. */
   segment(): void;
+  /** The map has grown. */
+  tile(): void;
   /** The stream of events is connected, or was lost and is being tried again. */
   connected(connected: boolean): void;
 }
@@ -226,9 +294,21 @@ export function followJob(job: string, listener: JobListener): () => void {
     on("state", heardJob);
     on("progress", heardJob);
     on("segment", () => listener.segment());
+    on("tile", () => listener.tile());
+  };
+  // After a sleep or a cut a connection may look alive for minutes: whoever comes back to the page gets a new one.
+  const anew = () => {
+    if (document.hidden) return;
+    clearTimeout(timer);
+    source.close();
+    connect();
   };
   connect();
+  addEventListener("online", anew);
+  document.addEventListener("visibilitychange", anew);
   return () => {
+    removeEventListener("online", anew);
+    document.removeEventListener("visibilitychange", anew);
     clearTimeout(timer);
     source.close();
   };

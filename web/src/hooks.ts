@@ -74,10 +74,12 @@ export interface Followed {
   job: Job | null;
   /** Recording segments announced while following. */
   segments: number;
+  /** How often the map has grown while following. */
+  tiles: number;
   connected: boolean;
 }
 
-const NOTHING_HEARD: Followed = { job: null, segments: 0, connected: true };
+const NOTHING_HEARD: Followed = { job: null, segments: 0, tiles: 0, connected: true };
 
 /** Follows a job live while `active`; `onEnd` is called when it has come to its end. */
 export function useFollowed(job: string | null, active: boolean, onEnd: () => void): Followed {
@@ -91,6 +93,7 @@ export function useFollowed(job: string | null, active: boolean, onEnd: () => vo
         if (!isActive(now)) onEnd();
       },
       segment: () => setHeard((before) => ({ ...before, segments: before.segments + 1 })),
+      tile: () => setHeard((before) => ({ ...before, tiles: before.tiles + 1 })),
       connected: (connected) => setHeard((before) => ({ ...before, connected })),
     });
   }, [job, active]);

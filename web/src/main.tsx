@@ -3,16 +3,31 @@
 import "./style.css";
 import { render } from "preact";
 import { useEffect, useRef } from "preact/hooks";
-import { Link, useRoute } from "./router.tsx";
+import { lazy } from "./lazy.tsx";
+import { UploadPill } from "./parts/upload_pill.tsx";
+import { useDroppedFiles } from "./parts/dropped.ts";
+import { go, Link, useRoute, type Route } from "./router.tsx";
 import { texts } from "./texts.ts";
-import { RunView } from "./views/run.tsx";
+import { keepFiles } from "./uploads_inbox.ts";
 import { RunsView } from "./views/runs.tsx";
 import { UnknownView } from "./views/unknown.tsx";
+
+const RunView = lazy(async () => (await import("./views/run.tsx")).RunView);
+const CompareView = lazy(async () => (await import("./views/compare.tsx")).CompareView);
+const SendView = lazy(async () => (await import("./views/send.tsx")).SendView);
+const LiveView = lazy(async () => (await import("./views/live.tsx")).LiveView);
+const QueueView = lazy(async () => (await import("./views/queue.tsx")).QueueView);
+const SettingsView = lazy(async () => (await import("./views/settings.tsx")).SettingsView);
+
+/** What changes when another view begins: then the reading starts at its top. */
+function addressOf(route: Route): string {
+  return "run" in route ? `${route.view} ${route.run}` : route.view;
+}
 
 function App() {
   const route = useRoute();
   const main = useRef<HTMLElement>(null);
-  const address = route.view === "run" ? `run ${route.run}` : route.view;
+  const address = addressOf(route);
   const shown = useRef(address);
 
   // A new view: whoever reads with the keyboard or by ear starts at its top.
@@ -20,6 +35,12 @@ function App() {
     if (shown.current !== address) main.current?.focus();
     shown.current = address;
   }, [address]);
+
+  // Files may be let go anywhere: the page for sending takes them.
+  const dragging = useDroppedFiles((files) => {
+    keepFiles(files);
+    if (route.view !== "send") go("/send");
+  });
 
   return (
     <>
@@ -29,21 +50,53 @@ function App() {
       <header class="bar">
         <nav aria-label={texts.menu}>
           <Link to="/" class="brand" label={texts.product}>
-            <img src="/favicon.svg" alt="" width="28" height="28" />
+            <img src="/favicon.svg" alt="" width="26" height="26" />
             <span>{texts.product}</span>
           </Link>
-          <Link to="/" current={route.view === "runs"}>
-            {texts.runs.title}
-          </Link>
+          <div class="menu">
+            <Link to="/" current={route.view === "runs" || route.view === "run" || route.view === "compare"}>
+              {texts.nav.runs}
+            </Link>
+            <Link to="/live" current={route.view === "live"}>
+              {texts.nav.live}
+            </Link>
+            <Link to="/queue" current={route.view === "queue"}>
+              {texts.nav.queue}
+            </Link>
+            <Link to="/settings" current={route.view === "settings"}>
+              {texts.nav.settings}
+            </Link>
+          </div>
+          <UploadPill current={route.view === "send"} />
         </nav>
       </header>
-      <main id="main" ref={main} tabIndex={-1}>
-        {route.view === "runs" && <RunsView />}
-        {route.view === "run" && <RunView key={route.run} run={route.run} job={route.job} />}
-        {route.view === "unknown" && <UnknownView path={route.path} />}
+      <main id="main" ref={main} tabIndex={-1} class={dragging ? "dragging" : ""}>
+        <View route={route} />
       </main>
+      {dragging && <p class="drop-veil">{texts.dropAnywhere}</p>}
     </>
   );
+}
+
+function View({ route }: { route: Route }) {
+  switch (route.view) {
+    case "runs":
+      return <RunsView />;
+    case "run":
+      return <RunView key={route.run} run={route.run} job={route.job} tab={route.tab} />;
+    case "compare":
+      return <CompareView key={`${route.run} ${route.left} ${route.right}`} run={route.run} left={route.left} right={route.right} />;
+    case "send":
+      return <SendView />;
+    case "live":
+      return <LiveView />;
+    case "queue":
+      return <QueueView />;
+    case "settings":
+      return <SettingsView section={route.section} />;
+    case "unknown":
+      return <UnknownView path={route.path} />;
+  }
 }
 
 const root = document.getElementById("app");

@@ -4,19 +4,52 @@ import type { ComponentChildren, JSX } from "preact";
 import { useEffect, useState } from "preact/hooks";
 
 /** What a path stands for. */
-export type Route = { view: "runs" } | { view: "run"; run: string; job: string | null } | { view: "unknown"; path: string };
+export type Route =
+  | { view: "runs" }
+  | { view: "send" }
+  | { view: "live" }
+  | { view: "queue" }
+  | { view: "settings"; section: string }
+  | { view: "run"; run: string; job: string | null; tab: string | null }
+  | { view: "compare"; run: string; left: string | null; right: string | null }
+  | { view: "unknown"; path: string };
 
-/** Reads a path and its query: `/`, `/runs/{id}`, `/runs/{id}?job={id}`. */
+const PLAIN: Record<string, Route> = {
+  "/": { view: "runs" },
+  "/runs": { view: "runs" },
+  "/send": { view: "send" },
+  "/live": { view: "live" },
+  "/queue": { view: "queue" },
+  "/settings": { view: "settings", section: "rigs" },
+};
+
+/** Reads a path and its query. */
 export function routeOf(location: { pathname: string; search: string }): Route {
-  if (location.pathname === "/" || location.pathname === "/runs") return { view: "runs" };
-  const run = /^\/runs\/([^/]+)\/?$/.exec(location.pathname)?.[1];
-  if (run === undefined) return { view: "unknown", path: location.pathname };
-  return { view: "run", run: decodeURIComponent(run), job: new URLSearchParams(location.search).get("job") };
+  const path = location.pathname.replace(/(.)\/$/, "$1");
+  const plain = PLAIN[path];
+  if (plain !== undefined) return plain;
+  const query = new URLSearchParams(location.search);
+  const [, first, second, third, more] = path.split("/");
+  const unknown: Route = { view: "unknown", path: location.pathname };
+  if (second === undefined || more !== undefined) return unknown;
+  if (first === "settings" && third === undefined) return { view: "settings", section: second };
+  if (first !== "runs") return unknown;
+  const run = decodeURIComponent(second);
+  if (third === undefined) return { view: "run", run, job: query.get("job"), tab: query.get("tab") };
+  return third === "compare" ? { view: "compare", run, left: query.get("left"), right: query.get("right") } : unknown;
 }
 
-/** The path of a run's page, with one of its jobs chosen or (null) the latest. */
-export function runPath(run: string, job: string | null = null): string {
-  return `/runs/${encodeURIComponent(run)}${job === null ? "" : `?job=${encodeURIComponent(job)}`}`;
+/** The path of a run's page, with one of its jobs chosen or (null) the latest, and one of the page's parts. */
+export function runPath(run: string, job: string | null = null, tab: string | null = null): string {
+  const query = new URLSearchParams();
+  if (job !== null) query.set("job", job);
+  if (tab !== null) query.set("tab", tab);
+  return `/runs/${encodeURIComponent(run)}${query.size === 0 ? "" : `?${query}`}`;
+}
+
+/** Two jobs of a run side by side. */
+export function comparePath(run: string, left: string, right: string): string {
+  return `/runs/${encodeURIComponent(run)}/compare?${new URLSearchParams({ left, right })}`;
 }
 
 /** Goes to another of our pages; `replace` leaves no step to go back to. */
@@ -24,6 +57,24 @@ export function go(path: string, replace = false): void {
   if (replace) history.replaceState(null, "", path);
   else history.pushState(null, "", path);
   dispatchEvent(new PopStateEvent("popstate"));
+}
+
+/** What the address says behind its question mark. */
+export function readQuery(): URLSearchParams {
+  return new URLSearchParams(location.search);
+}
+
+/** Changes what the address says, so that it can be shared and found again after a reload; null takes a word out. The view stays. */
+export function writeQuery(change: Record<string, string | null>): void {
+  const query = readQuery();
+  for (const [name, value] of Object.entries(change)) {
+    if (value === null || value === "") query.delete(name);
+    else query.set(name, value);
+  }
+  // Commas are allowed in a query and easier to read than their codes.
+  const text = query.toString().replaceAll("%2C", ",");
+  const path = `${location.pathname}${text === "" ? "" : `?${text}`}`;
+  if (path !== `${location.pathname}${location.search}`) history.replaceState(history.state, "", path);
 }
 
 /** The current route; the component renders again when it changes. */
@@ -37,18 +88,18 @@ export function useRoute(): Route {
   return route;
 }
 
-type LinkProps = { to: string; class?: string; current?: boolean; label?: string; children: ComponentChildren };
+type LinkProps = { to: string; id?: string; class?: string; current?: boolean; label?: string; keepPlace?: boolean; role?: "tab"; selected?: boolean; children: ComponentChildren };
 
 /** A link to one of our own pages; a click with a modifier key opens it elsewhere, as in any page. */
-export function Link({ to, current, label, children, ...rest }: LinkProps): JSX.Element {
+export function Link({ to, current, label, keepPlace, selected, children, ...rest }: LinkProps): JSX.Element {
   const follow = (event: MouseEvent) => {
     if (event.button !== 0 || event.metaKey || event.ctrlKey || event.shiftKey || event.altKey) return;
     event.preventDefault();
     go(to);
-    scrollTo(0, 0);
+    if (!keepPlace) scrollTo(0, 0);
   };
   return (
-    <a href={to} onClick={follow} aria-current={current ? "page" : undefined} aria-label={label} {...rest}>
+    <a href={to} onClick={follow} aria-current={current ? "page" : undefined} aria-selected={selected} aria-label={label} {...rest}>
       {children}
     </a>
   );

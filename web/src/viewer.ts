@@ -40,10 +40,13 @@ const SIMD_PROBE = new Uint8Array([
   0, 97, 115, 109, 1, 0, 0, 0, 1, 5, 1, 96, 0, 1, 123, 3, 2, 1, 0, 10, 10, 1, 8, 0, 65, 0, 253, 15, 253, 98, 11,
 ]);
 
+/** Set when the page is built. */
+declare const VIEWER_FOLDER: string;
+
 const CHANNEL = "stria";
 
 /** Where the server keeps the viewer's two files, at the version of its own SDK. */
-const FOLDER = "/viewer";
+const FOLDER = VIEWER_FOLDER;
 
 let loaded: Promise<void> | undefined;
 

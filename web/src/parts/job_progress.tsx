@@ -3,6 +3,7 @@
 import { cancelJob, isActive, retryJob, type Job } from "../api.ts";
 import { percent } from "../format.ts";
 import { texts } from "../texts.ts";
+import { runTexts } from "../texts/run.ts";
 import { ActionButton } from "./action_button.tsx";
 import { ProblemBox } from "./problem.tsx";
 import { Warnings } from "./warnings.tsx";
@@ -17,16 +18,16 @@ export function JobProgress({ job, onChanged }: Props) {
   };
   return (
     <section class="card">
-      <h2>{texts.progress.heading}</h2>
+      <h2>{runTexts.progress.heading}</h2>
       {isActive(job) && (
         <>
-          {job.attempt > 1 && <p>{texts.progress.attempt(job.attempt)}</p>}
-          {job.error && <ProblemBox problem={job.error} heading={texts.progress.lastAttempt} />}
-          <p role="status">{job.cancelling ? texts.progress.cancelling : stageInWords(job)}</p>
+          {job.attempt > 1 && <p>{runTexts.progress.attempt(job.attempt)}</p>}
+          {job.error && <ProblemBox problem={job.error} heading={runTexts.progress.lastAttempt} />}
+          <p role="status">{job.cancelling ? runTexts.progress.cancelling : stageInWords(job)}</p>
           {job.state === "running" && <Numbers job={job} />}
           <p class="actions">
             <ActionButton action={act(cancelJob)} disabled={job.cancelling}>
-              {texts.progress.cancel}
+              {runTexts.progress.cancel}
             </ActionButton>
           </p>
         </>
@@ -35,13 +36,13 @@ export function JobProgress({ job, onChanged }: Props) {
       {job.state === "failed" && (
         <>
           {job.error && <ProblemBox problem={job.error} />}
-          <p>{texts.progress.failedHint}</p>
+          <p>{runTexts.progress.failedHint}</p>
         </>
       )}
-      {job.state === "cancelled" && <p>{texts.progress.cancelled}</p>}
+      {job.state === "cancelled" && <p>{runTexts.progress.cancelled}</p>}
       {(job.state === "failed" || job.state === "cancelled") && (
         <p class="actions">
-          <ActionButton action={act(retryJob)}>{texts.progress.retry}</ActionButton>
+          <ActionButton action={act(retryJob)}>{runTexts.progress.retry}</ActionButton>
         </p>
       )}
     </section>
@@ -49,20 +50,20 @@ export function JobProgress({ job, onChanged }: Props) {
 }
 
 function stageInWords(job: Job): string {
-  if (job.state === "queued") return texts.progress.queued;
-  return job.stage === "" ? texts.progress.starting : texts.progress.stage(job.stage);
+  if (job.state === "queued") return runTexts.progress.queued;
+  return job.stage === "" ? runTexts.progress.starting : runTexts.progress.stage(job.stage);
 }
 
 function Numbers({ job }: { job: Job }) {
   const parts = [
     percent(job.progress),
-    texts.progress.frames(job.frames, job.frames_total ?? null),
-    ...(job.frames_per_s > 0 ? [texts.progress.rate(job.frames_per_s)] : []),
-    ...(job.time_left_s ? [texts.progress.left(job.time_left_s)] : []),
+    runTexts.progress.frames(job.frames, job.frames_total ?? null),
+    ...(job.frames_per_s > 0 ? [runTexts.progress.rate(job.frames_per_s)] : []),
+    ...(job.time_left_s ? [runTexts.progress.left(job.time_left_s)] : []),
   ];
   return (
     <>
-      <progress max={1} value={job.progress} aria-label={texts.progress.bar} />
+      <progress max={1} value={job.progress} aria-label={texts.progressBar} />
       <p class="faint">{parts.join(" · ")}</p>
     </>
   );

@@ -2,9 +2,9 @@
 
 import type { Job, Product } from "../api.ts";
 import { size } from "../format.ts";
-import { texts } from "../texts.ts";
+import { runTexts } from "../texts/run.ts";
 
-const words = texts.products;
+const words = runTexts.products;
 const ORDER = Object.keys(words.about);
 
 /** Files people ask for first come first; files we have no words for come last. */
@@ -16,7 +16,7 @@ function rank(product: Product): number {
 export function Products({ job, products }: { job: Job; products: Product[] }) {
   const files = products.filter((product) => !product.name.includes("/")).sort((a, b) => rank(a) - rank(b));
   return (
-    <section class="card">
+    <section>
       <h2>{words.heading}</h2>
       {files.length === 0 ? (
         <p>{words.none}</p>

@@ -2,17 +2,17 @@
 
 import { getManifest, type Job, type Manifest } from "../api.ts";
 import { once, useLoaded } from "../hooks.ts";
-import { texts } from "../texts.ts";
+import { runTexts } from "../texts/run.ts";
 import { ProblemBox } from "./problem.tsx";
 import { Warnings } from "./warnings.tsx";
 
 const GAPS_SHOWN = 10;
-const words = texts.quality;
+const words = runTexts.quality;
 
 export function Quality({ job }: { job: Job }) {
   const manifest = useLoaded(`manifest ${job.id}`, () => getManifest(job.id), once);
   return (
-    <section class="card">
+    <section>
       <h2>{words.heading}</h2>
       {manifest.problem && <ProblemBox problem={manifest.problem} onRetry={manifest.reload} />}
       <Warnings warnings={job.warnings} />

@@ -1,28 +1,24 @@
-// What an upload must say beside its files: the asset, the rig, the recipe.
+// What an upload must say beside its files: the asset, the rig, the recipe, where it begins.
 
 import { useId } from "preact/hooks";
-import type { Recipe, Rig } from "../api.ts";
-import { texts } from "../texts.ts";
+import type { Asset, Recipe, Rig } from "../api.ts";
+import { uploadTexts } from "../texts/upload.ts";
+import type { UploadFields as Values } from "../uploads.ts";
 import { Field } from "./field.tsx";
 
-const words = texts.upload;
+const words = uploadTexts;
 
 /** The rig select's value for "the file that was added"; no stored rig has such a name. */
 export const RIG_FROM_FILE = "\0file";
 
-/** What is filled in, and what is wrong with it (null: nothing, or not checked yet). */
-export interface UploadValues {
-  asset: string;
-  rig: string;
-  recipe: string;
-}
-type Problems = { asset: string | null; rig: string | null };
+/** What is wrong with what is filled in (null: nothing, or not checked yet). */
+type Problems = Record<"asset" | "rig" | "chainage_mm", string | null>;
 
 type Props = {
-  values: UploadValues;
+  values: Values;
   problems: Problems;
-  onChange: (change: Partial<UploadValues>) => void;
-  assets: string[];
+  onChange: (change: Partial<Values>) => void;
+  assets: Asset[];
   rigFile: File | null;
   rigs: Rig[] | null;
   recipes: Recipe[] | null;
@@ -37,7 +33,7 @@ export function UploadFields({ values, problems, onChange, assets, rigFile, rigs
           <>
             <input id={id} {...aria} list={assetList} value={values.asset} autoComplete="off" onInput={(event) => onChange({ asset: event.currentTarget.value })} />
             <datalist id={assetList}>
-              {assets.map((name) => (
+              {assets.map(({ name }) => (
                 <option key={name} value={name} />
               ))}
             </datalist>
@@ -63,6 +59,20 @@ export function UploadFields({ values, problems, onChange, assets, rigFile, rigs
             {recipes?.map(({ name }) => (
               <option key={name} value={name}>
                 {name}
+              </option>
+            ))}
+          </select>
+        )}
+      </Field>
+      <Field label={words.chainage} hint={words.chainageHint} problem={problems.chainage_mm}>
+        {(id, aria) => <input id={id} {...aria} inputMode="decimal" autoComplete="off" value={values.chainage_mm} onInput={(event) => onChange({ chainage_mm: event.currentTarget.value })} />}
+      </Field>
+      <Field label={words.direction} hint={words.directionHint} problem={null}>
+        {(id, aria) => (
+          <select id={id} {...aria} value={values.direction} onChange={(event) => onChange({ direction: event.currentTarget.value })}>
+            {Object.entries(words.directions).map(([direction, text]) => (
+              <option key={direction} value={direction}>
+                {text}
               </option>
             ))}
           </select>

@@ -2,11 +2,11 @@
 
 import { useEffect, useRef, useState } from "preact/hooks";
 import { getBytes, getRecording, isActive, problemOf, type Job, type Problem } from "../api.ts";
-import { texts } from "../texts.ts";
+import { runTexts } from "../texts/run.ts";
 import { startViewer, viewerRuns, type Viewer } from "../viewer.ts";
 import { ProblemBox } from "./problem.tsx";
 
-const words = texts.view;
+const words = runTexts.view;
 
 /** Segments are announced by events; this is how long we wait where an announcement got lost. */
 const POLL_MS = 2000;
@@ -19,7 +19,7 @@ export function View3d(props: Props) {
   const { job } = props;
   if (job.state === "failed" || job.state === "cancelled") return null;
   return (
-    <section class="card">
+    <section class="space">
       <h2>{words.heading}</h2>
       {!viewerRuns() && <p>{words.old}</p>}
       {viewerRuns() && !open && (
