@@ -1,6 +1,9 @@
 //! Live runs from outside: senders that we did not write, and one in Python that speaks the WebSocket protocol; what they
 //! sent is what is processed, bit for bit, whatever happens to the connection or the server.
 
+#[path = "live/hostile.rs"]
+mod hostile;
+
 use std::io::{BufRead, BufReader};
 use std::path::{Path, PathBuf};
 use std::process::{Child, Command, Stdio};

@@ -6,6 +6,7 @@
 
 mod watch;
 
+use std::collections::BTreeMap;
 use std::sync::Arc;
 use std::time::Duration;
 
@@ -111,14 +112,13 @@ impl Live {
         Ok(Connection {
             live: self.clone(),
             kind: hello.kind,
-            next_seq: to_u64(row.next_seq),
             row,
             hash,
             missing,
-            waiting: Vec::new(),
-            waiting_frames: 0,
+            waiting_frames: BTreeMap::new(),
+            waiting_bytes: Vec::new(),
+            waiting_size_bytes: 0,
             waiting_since: None,
-            first_time_ns: None,
             begins_part: true,
             turn,
         })
@@ -195,21 +195,35 @@ fn said(row: stream::Model) -> StreamState {
     }
 }
 
+/// A frame that is not durable yet.
+struct WaitingFrame {
+    capture_time_ns: i64,
+    image: Bytes,
+    image_crc32c: u32,
+}
+
+/// A segment as it is written, and what it says of the stream.
+struct Sealed {
+    bytes: Vec<u8>,
+    next_seq: u64,
+    missing: Vec<[u64; 2]>,
+    /// Capture time of its first frame.
+    first_time_ns: Option<i64>,
+}
+
 /// A connection's right to write to a stream.
 pub struct Connection {
     live: Live,
     kind: SegmentKind,
     row: stream::Model,
-    /// The number that comes next; what is before it and not missing is durable or in `waiting`.
-    next_seq: u64,
     hash: Sha256,
     missing: Vec<[u64; 2]>,
-    /// The segment that grows.
-    waiting: Vec<u8>,
-    waiting_frames: u64,
+    /// The segment that grows: frames by their numbers, so that what is only a little late still finds its place, or
+    /// bytes of a transport stream.
+    waiting_frames: BTreeMap<u64, WaitingFrame>,
+    waiting_bytes: Vec<u8>,
+    waiting_size_bytes: usize,
     waiting_since: Option<Instant>,
-    /// Capture time of the run's first frame, where it came through this connection.
-    first_time_ns: Option<i64>,
     /// The next segment of a transport stream begins a stream of its own.
     begins_part: bool,
     turn: Turn,
@@ -233,15 +247,15 @@ impl Connection {
 
     /// The number that comes next.
     pub fn next_seq(&self) -> u64 {
-        self.next_seq
+        self.waiting_frames.last_key_value().map_or(self.durable_next_seq(), |(seq, _)| seq + 1)
     }
 
     /// Frames received so far.
     pub fn frames(&self) -> u64 {
-        to_u64(self.row.frames) + self.waiting_frames
+        to_u64(self.row.frames) + self.waiting_frames.len() as u64
     }
 
-    /// The frames that were never sent.
+    /// The frames before the first that is not durable that were never sent, or came too late.
     pub fn missing(&self) -> &[[u64; 2]] {
         &self.missing
     }
@@ -251,42 +265,45 @@ impl Connection {
         self.turn.wanted()
     }
 
-    /// Takes a frame; one that came before is dropped. The image's CRC-32C is the caller's to check.
-    pub fn push_frame(&mut self, seq: u64, capture_time_ns: i64, image: &[u8], image_crc32c: u32) {
-        if seq < self.next_seq {
-            return;
+    /// Takes a frame. One that is there already is dropped, and so is one whose place is behind what is durable: the
+    /// job has passed it; false says so. The image's CRC-32C is the caller's to check.
+    pub fn push_frame(&mut self, seq: u64, capture_time_ns: i64, image: Bytes, image_crc32c: u32) -> bool {
+        if seq < self.durable_next_seq() || self.waiting_frames.contains_key(&seq) {
+            return false;
         }
-        if seq > self.next_seq {
-            self.note_missing(self.next_seq, seq - 1);
-        }
-        if self.row.frames == 0 && self.waiting_frames == 0 {
-            self.first_time_ns = Some(capture_time_ns);
-        }
-        append_record(&mut self.waiting, seq, capture_time_ns, image, image_crc32c);
-        self.next_seq = seq + 1;
-        self.waiting_frames += 1;
+        self.waiting_size_bytes += image.len();
+        self.waiting_frames.insert(seq, WaitingFrame { capture_time_ns, image, image_crc32c });
         self.waiting_since.get_or_insert_with(Instant::now);
-    }
-
-    fn note_missing(&mut self, first: u64, last: u64) {
-        let full = self.missing.len() >= MAX_GAPS;
-        match self.missing.last_mut() {
-            Some(range) if full || range[1] + 1 == first => range[1] = last,
-            _ => self.missing.push([first, last]),
-        }
+        true
     }
 
     /// Takes bytes of a transport stream.
     pub fn push_bytes(&mut self, bytes: &[u8]) {
-        self.waiting.extend_from_slice(bytes);
+        self.waiting_size_bytes += bytes.len();
+        self.waiting_bytes.extend_from_slice(bytes);
         self.waiting_since.get_or_insert_with(Instant::now);
+    }
+
+    /// What waits, as it will be written.
+    fn seal(&self) -> Sealed {
+        let (mut bytes, mut missing) = (self.waiting_bytes.clone(), self.missing.clone());
+        let mut next_seq = self.durable_next_seq();
+        for (seq, frame) in &self.waiting_frames {
+            if *seq > next_seq {
+                note_missing(&mut missing, next_seq, seq - 1);
+            }
+            append_record(&mut bytes, *seq, frame.capture_time_ns, &frame.image, frame.image_crc32c);
+            next_seq = seq + 1;
+        }
+        let first_time_ns = self.waiting_frames.first_key_value().map(|(_, frame)| frame.capture_time_ns);
+        Sealed { bytes, next_seq, missing, first_time_ns }
     }
 
     /// When the growing segment shall be closed; `None` where nothing waits.
     pub fn due_at(&self) -> Option<Instant> {
         let limits = &self.live.limits;
         let since = self.waiting_since?;
-        let full = self.waiting.len() >= limits.segment_bytes || self.waiting_frames >= limits.credit;
+        let full = self.waiting_size_bytes >= limits.segment_bytes || self.waiting_frames.len() as u64 >= limits.credit;
         Some(if full { since } else { since + limits.segment_time })
     }
 
@@ -300,14 +317,15 @@ impl Connection {
     /// # Errors
     /// [`Error::Locked`] where another server took the stream over, [`Error::Gone`] where the run was deleted or closed.
     pub async fn flush(&mut self) -> Result<()> {
-        if self.waiting.is_empty() {
+        if self.waiting_since.is_none() {
             return Ok(());
         }
         let number = u32::try_from(self.row.segments).map_err(|_| Error::Internal("too many segments".into()))?;
         let key = Key::source_segment(&self.row.run_id, number, self.row.fence, self.kind.extension());
-        // A failed write leaves it to be written again.
-        let bytes = Bytes::copy_from_slice(&self.waiting);
-        let (store, hash) = (&self.live.store, self.hash.clone().chain_update(&self.waiting));
+        // A failed write leaves what waits to be written again.
+        let sealed = self.seal();
+        let bytes = Bytes::from(sealed.bytes);
+        let (store, hash) = (&self.live.store, self.hash.clone().chain_update(&bytes));
         let facts = retried(ANSWER_PATIENCE, || store.put_durable(&key, bytes.clone())).await?;
         let part = self.begins_part && self.kind == SegmentKind::TransportStream;
         let segment = source_segment::Model {
@@ -316,28 +334,35 @@ impl Connection {
             fence: self.row.fence,
             bytes: to_i64(facts.bytes),
             sha256: facts.sha256,
-            frames: to_i64(self.waiting_frames),
+            frames: self.waiting_frames.len() as i64,
             part_arrival_ns: part.then(|| now_ms().saturating_mul(1_000_000)),
         };
         let row = stream::Model {
             beat: self.row.beat + 1,
-            next_seq: to_i64(self.next_seq),
+            next_seq: to_i64(sealed.next_seq),
             frames: self.row.frames + segment.frames,
             segments: self.row.segments + 1,
             bytes: self.row.bytes + segment.bytes,
-            missing: serde_json::to_string(&self.missing).unwrap_or_default(),
+            missing: serde_json::to_string(&sealed.missing)
+                .map_err(|e| Error::Internal(format!("a list of gaps is not JSON: {e}")))?,
             hash_state: resumed_hash::write(&hash),
             ..self.row.clone()
         };
-        retried(ANSWER_PATIENCE, || self.record(&segment, &row)).await?;
+        retried(ANSWER_PATIENCE, || self.record(&segment, &row, sealed.first_time_ns)).await?;
         self.live.bell.ring();
-        (self.row, self.hash) = (row, hash);
-        self.waiting.clear();
-        (self.waiting_frames, self.waiting_since, self.begins_part) = (0, None, false);
+        (self.row, self.hash, self.missing) = (row, hash, sealed.missing);
+        self.waiting_frames.clear();
+        self.waiting_bytes.clear();
+        (self.waiting_size_bytes, self.waiting_since, self.begins_part) = (0, None, false);
         Ok(())
     }
 
-    async fn record(&self, segment: &source_segment::Model, row: &stream::Model) -> Result<()> {
+    async fn record(
+        &self,
+        segment: &source_segment::Model,
+        row: &stream::Model,
+        first_time_ns: Option<i64>,
+    ) -> Result<()> {
         let t = self.live.db.write().await?;
         let change = stream::ActiveModel {
             beat: Set(row.beat),
@@ -353,7 +378,7 @@ impl Connection {
             return Err(self.not_mine(&*t).await?);
         }
         let mut change = run::ActiveModel { source_bytes: Set(row.bytes), ..Default::default() };
-        if let Some(time_ns) = self.first_time_ns.filter(|_| segment.number == 0) {
+        if let Some(time_ns) = first_time_ns.filter(|_| segment.number == 0) {
             change.recorded_ms = Set(time_ns.div_euclid(1_000_000));
         }
         let still_there = run::Column::Id.eq(&row.run_id).and(run::Column::SourceOpen.eq(1));
@@ -420,6 +445,14 @@ async fn close_run(records: &impl ConnectionTrait, row: &stream::Model) -> Resul
     let mine = stream::Column::Name.eq(&row.name).and(stream::Column::RunId.eq(&row.run_id));
     stream::Entity::update_many().set(change).filter(mine).exec(records).await?;
     Ok(())
+}
+
+fn note_missing(missing: &mut Vec<[u64; 2]>, first: u64, last: u64) {
+    let full = missing.len() >= MAX_GAPS;
+    match missing.last_mut() {
+        Some(range) if full || range[1] + 1 == first => range[1] = last,
+        _ => missing.push([first, last]),
+    }
 }
 
 fn check_stream_name(name: &str) -> Result<()> {

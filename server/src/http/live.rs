@@ -7,6 +7,7 @@ use axum::extract::{Request, State};
 use axum::http::StatusCode;
 use axum::http::request::Parts;
 use axum::response::{IntoResponse, Json, Response};
+use bytes::Bytes;
 use serde::{Deserialize, Serialize};
 use stria_core::source::frame_file::still_format;
 use stria_core::source::segments::SegmentKind;
@@ -26,6 +27,9 @@ const FRAME_HEAD_BYTES: usize = 20;
 
 /// So often a connection that brings nothing is asked whether it is still there.
 const PING_EVERY: Duration = Duration::from_secs(10);
+
+/// How long a sender that was told an error is given to hear it.
+const LAST_WORDS: Duration = Duration::from_secs(2);
 
 /// A transport stream is packets of so many bytes, each with this first byte.
 const TS_PACKET_BYTES: usize = 188;
@@ -173,8 +177,10 @@ impl Talk {
         let (wanted, stop) = (connection.wanted_by_another().clone(), self.app.stop.clone());
         let mut heard_at = Instant::now();
         let mut ping_at = heard_at + PING_EVERY;
+        // Whoever sends what is durable already has not heard of it.
+        let mut owed_at: Option<Instant> = None;
         loop {
-            let due_at = connection.due_at().unwrap_or(ping_at).min(ping_at);
+            let due_at = [connection.due_at(), owed_at].into_iter().flatten().fold(ping_at, Instant::min);
             let message = tokio::select! {
                 biased;
                 () = wanted.cancelled() => return Err(Error::Locked("another connection has taken the stream over".into())),
@@ -185,8 +191,10 @@ impl Talk {
             match message {
                 Some(None) => return Err(Error::SenderSilent),
                 Some(Some(Message::Binary(frame))) => {
-                    take_frame(connection, &frame)?;
                     heard_at = Instant::now();
+                    if !take_frame(connection, frame)? {
+                        owed_at.get_or_insert(heard_at + limits.ack_every);
+                    }
                 }
                 Some(Some(Message::Text(text))) => match serde_json::from_str(&text).map_err(|e| unreadable(&e))? {
                     Said::End {} => {
@@ -199,9 +207,11 @@ impl Talk {
                 Some(Some(_)) => heard_at = Instant::now(),
                 None => {}
             }
-            if connection.is_due() {
+            let owed = owed_at.is_some_and(|at| at <= Instant::now());
+            if connection.is_due() || owed {
                 connection.flush().await?;
                 self.acknowledge(connection).await?;
+                owed_at = None;
             }
             let now = Instant::now();
             if now >= ping_at {
@@ -210,7 +220,7 @@ impl Talk {
                 }
                 connection.beat().await?;
                 self.acknowledge(connection).await?;
-                self.send(Message::Ping(bytes::Bytes::new())).await?;
+                self.send(Message::Ping(Bytes::new())).await?;
                 ping_at = now + PING_EVERY;
             }
         }
@@ -260,6 +270,10 @@ impl Talk {
             let code = if problem.retryable { close_code::AGAIN } else { close_code::POLICY };
             let reason = problem.title.as_str().into();
             let _ = self.send(Message::Close(Some(CloseFrame { code, reason }))).await;
+            // A connection that is closed on data that nobody read is reset, and what was said last is lost.
+            let gone = async { while let Ok(Some(_)) = self.next_message().await {} };
+            let _ = tokio::time::timeout(LAST_WORDS, gone).await;
+            tokio::time::sleep(LAST_WORDS / 4).await;
         }
     }
 }
@@ -272,8 +286,8 @@ fn too_many(app: &App) -> Error {
     Error::Busy(format!("{} streams are open already; come back in a moment", app.config.live.streams_at_once))
 }
 
-/// A binary message → a frame of the stream.
-fn take_frame(connection: &mut Connection, message: &[u8]) -> Result<()> {
+/// A binary message → a frame of the stream; false where it was there already.
+fn take_frame(connection: &mut Connection, message: Bytes) -> Result<bool> {
     let short = || {
         let found = format!("a frame of {} bytes", message.len());
         Error::field("frame", found, format!("{FRAME_HEAD_BYTES} bytes of head and an image"))
@@ -289,8 +303,8 @@ fn take_frame(connection: &mut Connection, message: &[u8]) -> Result<()> {
     if still_format(image).is_none() {
         return Err(Error::field("frame", format!("frame {seq} begins as no image"), "a whole JPEG, PNG or WebP file"));
     }
-    connection.push_frame(seq, i64::from_le_bytes(*time_ns), image, crc);
-    Ok(())
+    let time_ns = i64::from_le_bytes(*time_ns);
+    Ok(connection.push_frame(seq, time_ns, message.slice(FRAME_HEAD_BYTES..), crc))
 }
 
 /// The records keep numbers as signed ones.
@@ -378,7 +392,7 @@ struct Incoming {
 }
 
 impl Incoming {
-    async fn next(&mut self) -> Result<Option<bytes::Bytes>> {
+    async fn next(&mut self) -> Result<Option<Bytes>> {
         self.body.chunk(self.silence).await
     }
 
@@ -417,7 +431,7 @@ async fn take_all(
 ) -> Result<()> {
     let wanted = connection.wanted_by_another().clone();
     let mut splitter = JpegSplitter::new(app.config.live.frame_bytes);
-    let mut chunk = bytes::Bytes::from(first);
+    let mut chunk = Bytes::from(first);
     loop {
         match kind {
             SegmentKind::TransportStream => connection.push_bytes(&chunk),
@@ -428,7 +442,9 @@ async fn take_all(
                     let seq = frame.seq.unwrap_or(connection.next_seq());
                     check_number(seq)?;
                     let time_ns = frame.capture_time_ns.unwrap_or(now_ns);
-                    connection.push_frame(seq, time_ns, &frame.image, crc32c::crc32c(&frame.image));
+                    let crc = crc32c::crc32c(&frame.image);
+                    // One that comes again is dropped.
+                    let _ = connection.push_frame(seq, time_ns, frame.image, crc);
                 }
             }
         }
