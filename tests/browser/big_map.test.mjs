@@ -13,7 +13,7 @@ const MOST_MB = 400;
 let server, browser, small, run;
 
 before(async () => {
-  [server, small, browser] = [await startServer(), await simulate({ seconds: 1, size: "320x240" }), await startBrowser()];
+  [server, small, browser] = [await startServer(), await simulate({ seconds: 1, size: "320x240" }), await startBrowser({ plain: true })];
   run = await measuredRun(server, small);
 });
 after(async () => {
