@@ -2,6 +2,7 @@
 
 import { getTilesIndex, tilesFolder } from "../api.ts";
 import { getTile } from "../api_tiles.ts";
+import { depthsOf } from "../map/depths.ts";
 import type { TilesIndex } from "../map/pyramid.ts";
 
 export interface Points {
@@ -57,23 +58,18 @@ export async function loadPoints(job: string, progress: (share: number) => void,
 
 async function pointsOf(bytes: Blob, index: TilesIndex, level: number, column: number, row: number): Promise<Float32Array> {
   const side = index.tile_side_px;
-  const image = await createImageBitmap(bytes, { colorSpaceConversion: "none", premultiplyAlpha: "none" });
-  const context = new OffscreenCanvas(side, side).getContext("2d", { willReadFrequently: true });
-  if (context === null) throw new Error("no canvas");
-  context.drawImage(image, 0, 0);
-  image.close();
-  const { data } = context.getImageData(0, 0, side, side);
+  const { depth_mm } = await depthsOf(bytes, index.depth_step_mm, index.depth_offset_mm);
   const { x0_mm, y0_mm, mm_per_px } = index.grid;
   const step = mm_per_px * 2 ** level;
   const half = (step - mm_per_px) / 2;
   const points = new Float32Array(3 * side * side);
   let count = 0;
   for (let at = 0; at < side * side; at += 1) {
-    const value = data[4 * at]! * 65536 + data[4 * at + 1]! * 256 + data[4 * at + 2]!;
-    if (value === 0) continue;
+    const z_mm = depth_mm[at]!;
+    if (Number.isNaN(z_mm)) continue;
     points[count] = x0_mm + half + (column * side + (at % side)) * step;
     points[count + 1] = y0_mm + half + (row * side + Math.floor(at / side)) * step;
-    points[count + 2] = value * index.depth_step_mm + index.depth_offset_mm;
+    points[count + 2] = z_mm;
     count += 3;
   }
   return points.slice(0, count);
