@@ -284,6 +284,38 @@ fn a_robot_that_vanishes_leaves_a_processed_run_and_one_that_comes_back_goes_on(
 }
 
 #[test]
+fn a_transport_stream_that_was_cut_goes_on_as_a_new_part_of_the_same_run() {
+    let server = Server::start(&["--workers", "1", "--live-come-back-s", "20"]);
+    let (video, url) = (plain(&long_run().video), post_url(&server, "cut", long_run()));
+    let mut first = ffmpeg(&["-re", "-i", video, "-c:v", "libx264", "-g", "10", "-tune", "zerolatency"])
+        .args(["-f", "mpegts", "-method", "POST", &url])
+        .spawn()
+        .expect("ffmpeg is installed: docker/set-up.sh brings it");
+    eventually("some of it is there", || {
+        server.json("/api/live")["items"]
+            .as_array()
+            .is_some_and(|i| i.iter().any(|s| s["bytes"].as_u64() > Some(50_000)))
+    });
+    first.kill().and_then(|()| first.wait()).expect("it ends");
+    let before = stream(&server, "cut");
+    assert_eq!(before["open"], true);
+    run_ffmpeg(&["-re", "-i", video, "-c", "copy", "-f", "mpegts", "-method", "POST", &url]);
+    eventually("the run is closed", || stream(&server, "cut")["open"] == false);
+    let after = stream(&server, "cut");
+    assert_eq!(before["run"], after["run"]);
+    let job = server.wait_for_state(&text(&after, "/job"), "done");
+    // All of the second part, and what could be decoded of the first.
+    assert!(job["frames"].as_u64() > Some(65), "{job:#}");
+    // Again from the same segments: the same surface.
+    let again = json_of(
+        send(server.post(&format!("/api/runs/{}/jobs", text(&after, "/run"))).json(&serde_json::json!({}))),
+        201,
+    );
+    let (one, two) = (text(&after, "/job"), text(&again, "/id"));
+    assert_eq!(depth_map_sha256(&server, &one), depth_map_sha256(&server, &two));
+}
+
+#[test]
 fn what_cannot_be_used_is_refused_with_a_reason() {
     let server = server();
     let rig = form::percent_encoded(&long_run().rig_text());
