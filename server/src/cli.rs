@@ -2,6 +2,7 @@
 
 mod calibrate;
 mod engine;
+mod export;
 mod inspect;
 mod process;
 mod progress;
@@ -31,6 +32,7 @@ enum Command {
     Serve(serve::Serve),
     Work(work::Work),
     Send(send::Send),
+    Export(export::Export),
     Inspect(inspect::Inspect),
     /// Prints the OpenAPI document of the HTTP interface.
     #[command(hide = true)]
@@ -80,6 +82,7 @@ pub fn run() -> ExitCode {
         Command::Serve(command) => command.run(),
         Command::Work(command) => command.run(),
         Command::Send(command) => command.run(),
+        Command::Export(command) => command.run(),
         Command::Inspect(command) => command.run(),
         Command::Openapi => print_openapi(),
     };

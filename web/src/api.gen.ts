@@ -62,7 +62,10 @@ export interface paths {
             path?: never;
             cookie?: never;
         };
-        /** The job's MCAP archive: the product `archive.mcap`. */
+        /**
+         * The job's MCAP archive. Without parameters it is the product `archive.mcap`, with ranges and an ETag; with any, the
+         *     part that they name is made while it is sent.
+         */
         get: operations["get_archive"];
         put?: never;
         post?: never;
@@ -1147,7 +1150,16 @@ export interface operations {
     };
     get_archive: {
         parameters: {
-            query?: never;
+            query?: {
+                /** @description `false`: without the camera's frames. */
+                frames?: boolean;
+                /** @description Only every n-th frame with what was measured in it, and every n-th point of the surface. */
+                every?: number;
+                /** @description Only the wall from this chainage on, mm. */
+                from_mm?: number;
+                /** @description Only the wall up to this chainage, mm. */
+                to_mm?: number;
+            };
             header?: never;
             path: {
                 /** @description The job */
@@ -1179,6 +1191,14 @@ export interface operations {
                 };
                 content?: never;
             };
+            400: {
+                headers: {
+                    [name: string]: unknown;
+                };
+                content: {
+                    "application/problem+json": components["schemas"]["Problem"];
+                };
+            };
             404: {
                 headers: {
                     [name: string]: unknown;
@@ -1188,6 +1208,14 @@ export interface operations {
                 };
             };
             416: {
+                headers: {
+                    [name: string]: unknown;
+                };
+                content: {
+                    "application/problem+json": components["schemas"]["Problem"];
+                };
+            };
+            503: {
                 headers: {
                     [name: string]: unknown;
                 };
