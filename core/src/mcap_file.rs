@@ -32,7 +32,7 @@ pub struct Topic {
     /// How the schema is written down (`protobuf`, `ros2msg`, `jsonschema`).
     pub schema_encoding: String,
     /// The schema itself.
-    pub schema_data: Vec<u8>,
+    pub schema_data: Arc<Vec<u8>>,
     /// How the messages are packed (`protobuf`, `cdr`, `json`).
     pub encoding: String,
     /// More about it.
@@ -101,7 +101,8 @@ struct OpenFile {
     path: PathBuf,
     file: BufReader<Box<dyn Read + Send>>,
     reader: LinearReader,
-    schemas: HashMap<u16, (String, String, Vec<u8>)>,
+    /// Name, encoding and text of each.
+    schemas: HashMap<u16, (String, String, Arc<Vec<u8>>)>,
     topics: HashMap<u16, Arc<Topic>>,
 }
 
@@ -190,7 +191,7 @@ impl OpenFile {
             }
             match mcap::parse_record(opcode, data)? {
                 Raw::Schema { header, data } => {
-                    self.schemas.insert(header.id, (header.name, header.encoding, data.into_owned()));
+                    self.schemas.insert(header.id, (header.name, header.encoding, Arc::new(data.into_owned())));
                 }
                 Raw::Channel(channel) => {
                     let (schema, schema_encoding, schema_data) =
@@ -302,7 +303,7 @@ impl Contents {
                 name: channel.topic.clone(),
                 schema: schema.map(|s| s.name.clone()).unwrap_or_default(),
                 schema_encoding: schema.map(|s| s.encoding.clone()).unwrap_or_default(),
-                schema_data: schema.map(|s| s.data.to_vec()).unwrap_or_default(),
+                schema_data: Arc::new(schema.map(|s| s.data.to_vec()).unwrap_or_default()),
                 encoding: channel.message_encoding.clone(),
                 metadata: channel.metadata.clone(),
             };

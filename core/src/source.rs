@@ -1,5 +1,5 @@
-//! Where frames come from: video files, folders of images, a run's segments in a folder that may still grow; one trait
-//! over all.
+//! Where frames come from: video files, folders of images, MCAP files, a run's segments in a folder that may still grow;
+//! one trait over all.
 
 mod encoded;
 mod folder;

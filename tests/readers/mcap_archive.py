@@ -72,13 +72,34 @@ def image32(message):
     return {"encoding": message.encoding, "shape": list(z.shape), "last": float(z[-1, -1])}
 
 
+def scene(message):
+    def entity(e):
+        (cube,), (text,) = e.cubes, e.texts
+        p, s = cube.pose.position, cube.size
+        return {
+            "id": e.id,
+            "frame_id": e.frame_id,
+            "text": text.text,
+            "position": [p.x, p.y, p.z],
+            "size": [s.x, s.y, s.z],
+            "metadata": {pair.key: pair.value for pair in e.metadata},
+        }
+
+    return {"entities": [entity(e) for e in message.entities]}
+
+
 def stamps(message):
-    return message.transforms[0].timestamp if hasattr(message, "transforms") else message.timestamp
+    for part in ("transforms", "entities"):
+        if hasattr(message, part):
+            return getattr(message, part)[0].timestamp
+    return message.timestamp
 
 
 def describe(topic, message):
     if topic in ("/surface", "/profile"):
         return cloud(message)
+    if topic == "/defects":
+        return scene(message)
     if topic == "/depth_map/image":
         return image32(message)
     if topic.startswith("/depth_map"):

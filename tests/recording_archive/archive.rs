@@ -257,6 +257,31 @@ fn a_small_map_is_one_grid_and_a_wide_one_comes_in_pieces() {
 }
 
 #[test]
+fn defects_are_boxes_where_they_are() {
+    let dir = tempfile::tempdir().expect("a folder");
+    let path = dir.path().join("archive.mcap");
+    let known = KnownRun::new(64, 48, FPS);
+    let mut archive = writer(&path, &known);
+    archive.surface(0.4, &known.frame(10).points).expect("points");
+    let bounds = json!({"x_min_mm": 100.0, "x_max_mm": 140.0, "y_min_mm": -30.0, "y_max_mm": -10.0});
+    let defect = json!({"id": 7, "kind": "missing_material", "severity": "severe", "chainage_mm": 2120.0, "z_mm": 812.0,
+        "depth_mm": 8.0, "area_mm2": 5.0, "bounds": bounds});
+    archive.defects(json!({"schema_version": 1, "defects": [defect]}).to_string().as_bytes()).expect("defects");
+    assert!(archive.defects(b"{}").is_err(), "another text is refused");
+    archive.finish().expect("the end");
+    let read = read("mcap_archive.py", &[&path]);
+    let topic = &read["topics"]["/defects"];
+    assert_eq!((&topic["schema"], &topic["times_ns"]), (&json!("foxglove.SceneUpdate"), &json!([time_ns(10)])));
+    let entity = &topic["of"][0]["entities"][0];
+    assert_eq!((&entity["id"], &entity["frame_id"]), (&json!("defect 7"), &json!("world")));
+    assert_eq!(entity["text"], "7 missing material: 8.0 mm");
+    for (value, expected) in [("position", [0.12, -0.02, 0.808]), ("size", [0.04, 0.02, 0.008])] {
+        array(&entity[value]).iter().zip(expected).for_each(|(found, expected)| near(found, expected, 1e-12));
+    }
+    assert_eq!(entity["metadata"]["chainage_mm"], "2120");
+}
+
+#[test]
 fn a_damaged_archive_is_noticed_and_one_given_up_leaves_nothing() {
     let dir = tempfile::tempdir().expect("a folder");
     let path = dir.path().join("archive.mcap");

@@ -11,6 +11,7 @@
 //! | `/surface` | foxglove.PointCloud | the surface in `world`, in chunks of some frames |
 //! | `/measurement` | JSON | dx, dy, scale, residual, rows found, where on the wall |
 //! | `/log` | foxglove.Log | warnings |
+//! | `/defects` | foxglove.SceneUpdate | a box around each defect, where defects were looked for |
 //! | `/depth_map` | foxglove.Grid | the finished map, in pieces of bounded size |
 //! | `/depth_map/overview` | foxglove.Grid | the same, sampled to one piece, where there are several |
 //! | `/depth_map/image` | foxglove.RawImage | the map as a 32FC1 image in metres; sampled where it is large |
@@ -28,6 +29,7 @@
 mod cut;
 mod grid;
 mod points;
+mod scene;
 
 use std::collections::{BTreeMap, HashMap};
 use std::path::{Path, PathBuf};
@@ -266,6 +268,7 @@ impl ArchiveWriter {
         }
         self.chunk.points.extend_from_slice(points);
         self.chunk.last_s = time_s;
+        self.latest_s = self.latest_s.max(time_s);
         let full = self.chunk.points.len() >= CHUNK_POINTS || time_s - self.chunk.first_s >= CHUNK_S;
         if full { self.write_chunk() } else { Ok(()) }
     }
@@ -358,6 +361,17 @@ impl ArchiveWriter {
         self.write("/depth_map/image", time_s, &grid::image(timestamp, WORLD, &content))?;
         let (pieces, step) = (pieces.len().to_string(), geometry.mm_per_px.to_string());
         self.metadata("depth_map", &[("pieces", &pieces), ("image_mm_per_px", &step)])
+    }
+
+    /// Adds the defects that a `defects.json` lists, to be seen where they are, at the time of the latest message.
+    ///
+    /// # Errors
+    /// Another text; as [`ArchiveWriter::video`].
+    pub fn defects(&mut self, defects_json: &[u8]) -> Result<()> {
+        let scene: scene::DefectScene = serde_json::from_slice(defects_json)
+            .map_err(|e| Error::input("defects.json", e.to_string(), "a list of defects"))?;
+        let update = scene::update(self.timestamp(self.latest_s), WORLD, &scene);
+        self.write("/defects", self.latest_s, &update)
     }
 
     /// Adds a file.

@@ -31,7 +31,8 @@ use crate::surface::{Placed, SurfacePoint};
 const SEGMENTS: &str = "recording";
 
 /// Products that the archive keeps too, where they are made.
-const ARCHIVED: [(&str, &str); 2] = [("preview.png", "image/png"), ("defects.json", "application/json")];
+const ARCHIVED: [(&str, &str); 2] = [("preview.png", "image/png"), (DEFECTS, "application/json")];
+const DEFECTS: &str = "defects.json";
 
 /// All writers of a job.
 pub(super) struct Products<'a> {
@@ -417,6 +418,9 @@ impl<'a> Products<'a> {
             if path.exists() {
                 let bytes = std::fs::read(&path).map_err(|e| Error::io(&path, e))?;
                 archive.attach(name, media_type, &bytes)?;
+                if name == DEFECTS {
+                    archive.defects(&bytes)?;
+                }
             }
         }
         archive.finish()?;
