@@ -3,6 +3,8 @@
 
 use std::path::{Path, PathBuf};
 
+use nalgebra::Point3;
+
 use super::{FrameSteps, RecordedRun, Recorder, Segment};
 use crate::error::Result;
 use crate::export::manifest::Stretch;
@@ -109,6 +111,14 @@ impl Recordings {
             self.done.push(stretch);
         }
         Ok(())
+    }
+
+    /// As [`Recorder::log_newest`], for the whole.
+    ///
+    /// # Errors
+    /// As [`Recordings::create`].
+    pub fn log_newest(&mut self, frame_index: u32, time_s: f64, in_world: &[Point3<f64>]) -> Result<Vec<Segment>> {
+        self.whole.log_newest(frame_index, time_s, in_world)
     }
 
     /// As [`Recorder::log_map`], for the whole.
