@@ -6,6 +6,7 @@ use std::process::Output;
 use serde_json::Value;
 use stria_core::export::manifest::{Manifest, sha256_of_file};
 use stria_tests::support::readers::{python_program, run};
+use stria_tests::support::server::Server;
 use stria_tests::support::{Run, run_stria};
 use tempfile::TempDir;
 
@@ -91,6 +92,21 @@ fn a_bag_gives_the_same_map_as_its_images() {
         let (_, again, _) = images.process(&out.join("archive.mcap"), &format!("again-{encoding}"), &[]);
         assert_eq!(map_hash(&again), map_hash(&from_png), "{encoding}");
     }
+}
+
+#[test]
+fn a_bag_sent_to_a_server_is_a_run() {
+    let images = Images::new();
+    let bag = images.bag("sent", "jpg", &[]).join("sent.mcap");
+    let server = Server::start(&["--workers", "1"]);
+    let url = server.url("");
+    let command = ["send", text(&bag), "--server", &url, "--asset", "Wall", "--rig", text(&images.run.rig), "--wait"];
+    let done = run_stria(&command);
+    assert!(matches!(done.status.code(), Some(0 | 3)), "{}", said(&done));
+    let runs = server.json("/api/runs");
+    assert_eq!(runs["items"][0]["source"]["filename"], "sent.mcap", "{runs}");
+    let job = server.json(&format!("/api/jobs/{}", runs["items"][0]["job"]["id"].as_str().expect("a job")));
+    assert_eq!((&job["state"], &job["quality"]["frames"]), (&"done".into(), &30.into()), "{job}");
 }
 
 #[test]

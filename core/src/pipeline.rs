@@ -1,5 +1,6 @@
 //! The order of the stages: a source in, products out. Progress leaves as events; a stop comes back.
 
+mod archiving;
 mod colours;
 mod folder;
 mod laz;

@@ -2,6 +2,7 @@
 
 use std::path::Path;
 
+use super::archiving::ArchivedJob;
 use super::laz::LazThread;
 use super::progress::Progress;
 use super::quality::QualityCounter;
@@ -24,15 +25,11 @@ use crate::export::{depth_png, depth_tif, texture};
 use crate::motion::track::TrackUse;
 use crate::recording::{FrameSteps, RecordedRun, Recordings, Segment};
 use crate::rig::{LineDirection, Rig};
-use crate::source::{self, Beside, ODOMETRY_CSV, SourceInfo, encoded_frames, odometry_csv};
+use crate::source::{self, Beside, SourceInfo};
 use crate::surface::{Placed, SurfacePoint};
 
 /// Where live recording segments lie in the product folder; they are no products.
 const SEGMENTS: &str = "recording";
-
-/// Products that the archive keeps too, where they are made.
-const ARCHIVED: [(&str, &str); 2] = [("preview.png", "image/png"), (DEFECTS, "application/json")];
-const DEFECTS: &str = "defects.json";
 
 /// All writers of a job.
 pub(super) struct Products<'a> {
@@ -392,67 +389,16 @@ impl<'a> Products<'a> {
         PreviewText { title: self.request.source_name.clone(), ..PreviewText::default() }
     }
 
-    /// Completes the archive: the frames as they were given, the map, and what is attached. Returns what is to be
-    /// known of it, in words.
     fn finish_archive(
         &mut self,
         manifest: &Manifest,
         map: Option<&mut FinishedMap<'_>>,
         progress: &mut Progress<'_, '_>,
     ) -> Result<Option<String>> {
-        let Some(mut archive) = self.archive.take() else { return Ok(None) };
-        let request = self.request;
+        let Some(archive) = self.archive.take() else { return Ok(None) };
         progress.step("archive")?;
-        let note = self.archive_frames(&mut archive)?;
-        if let Some(map) = map {
-            let geometry = map.geometry();
-            archive.depth_map(&geometry, |column, row, width, height| map.window(column, row, width, height))?;
-        }
-        for warning in progress.warnings().iter().chain(&note) {
-            archive.warning(warning)?;
-        }
-        let json = serde_json::to_vec_pretty(manifest).map_err(|e| Error::internal("archive", e))?;
-        archive.attach("manifest.json", "application/json", &json)?;
-        for (name, media_type) in ARCHIVED {
-            let path = request.out_dir.join(name);
-            if path.exists() {
-                let bytes = std::fs::read(&path).map_err(|e| Error::io(&path, e))?;
-                archive.attach(name, media_type, &bytes)?;
-                if name == DEFECTS {
-                    archive.defects(&bytes)?;
-                }
-            }
-        }
-        archive.finish()?;
-        Ok(note)
-    }
-
-    /// The frames as the source holds them, and the poses that came with them.
-    fn archive_frames(&self, archive: &mut ArchiveWriter) -> Result<Option<String>> {
-        let request = self.request;
-        if let Some(path) = &request.poses {
-            let poses = std::fs::read(path).map_err(|e| Error::io(path, e))?;
-            archive.attach("poses.csv", "text/csv", &poses)?;
-        } else if !self.beside.poses.is_empty() {
-            archive.attach(ODOMETRY_CSV, "text/csv", odometry_csv(&self.beside.poses).as_bytes())?;
-        }
-        let frames = match encoded_frames(&request.source, &request.source_name, request.fps, &request.topics) {
-            Ok(frames) => frames,
-            Err(Error::Input { found, .. }) => return Ok(Some(format!("the archive holds no camera frames: {found}"))),
-            Err(error) => return Err(error),
-        };
-        let video = frames.video();
-        if let Some(video) = &video {
-            archive.video(video)?;
-        }
-        for frame in frames.take(self.frames as usize) {
-            archive.frame(&frame?)?;
-        }
-        Ok(video.filter(|video| video.reordered).map(|_| {
-            "the video has B-frames: the archive keeps it as it is, in decoding order, but Foxglove and rerun play MCAP video \
-             only without; record without B-frames (ffmpeg: -bf 0)"
-                .into()
-        }))
+        let job = ArchivedJob { request: self.request, beside: self.beside, frames: self.frames, manifest };
+        job.complete(archive, map, progress.warnings())
     }
 
     fn finish_recording(&mut self, picture: Option<Picture>, progress: &mut Progress<'_, '_>) -> Result<Vec<Stretch>> {
