@@ -74,7 +74,7 @@ pub fn cut(mut source: impl ArchiveSource, how: &ArchiveCut, out: impl Write, ou
         .disable_seeking(true)
         .library(concat!("stria ", env!("CARGO_PKG_VERSION")));
     let writer = options.create(NoSeek::new(out)).map_err(|e| failed(out_name, e))?;
-    let mut copy = Copy { writer, how, plan, name: out_name, channels: Vec::new() };
+    let mut copy = PartWriter { writer, how, plan, name: out_name, channels: Vec::new() };
     copy.say_what()?;
     let mut records = source.open()?;
     while let Some(record) = records.next(|_| true)? {
@@ -191,7 +191,7 @@ fn decoded<T: Decode>(message: &Message) -> Result<T> {
 }
 
 /// The archive that is being written.
-struct Copy<'a, W: Write> {
+struct PartWriter<'a, W: Write> {
     writer: Writer<NoSeek<W>>,
     how: &'a ArchiveCut,
     plan: Plan,
@@ -200,7 +200,7 @@ struct Copy<'a, W: Write> {
     channels: Vec<(String, u16)>,
 }
 
-impl<W: Write> Copy<'_, W> {
+impl<W: Write> PartWriter<'_, W> {
     fn say_what(&mut self) -> Result<()> {
         let how = self.how;
         let mut values = vec![("frames".to_string(), how.frames.to_string()), ("every".into(), how.every.to_string())];
