@@ -7,9 +7,9 @@ set -euo pipefail
 cd "$(dirname "$0")/.."
 
 BUILD="build-essential pkg-config clang libclang-dev libopencv-dev
-  libavcodec-dev libavformat-dev libavutil-dev"
+  libavcodec-dev libavformat-dev libavutil-dev libswscale-dev"
 RUN="libopencv-core406 libopencv-imgproc406 libopencv-video406 libopencv-calib3d406
-  libavcodec59 libavformat59 libavutil57 ca-certificates"
+  libavcodec59 libavformat59 libavutil57 libswscale6 ca-certificates"
 TEST="ffmpeg chromium python3-venv curl openssl postgresql"
 
 case "${1:-all}" in

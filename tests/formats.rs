@@ -1,33 +1,31 @@
-//! Products read back by programs that we did not write: GDAL (rasterio), tifffile, Pillow, plyfile, NumPy.
+//! Products read back by programs that we did not write: GDAL (rasterio), tifffile, Pillow, plyfile, NumPy, laspy,
+//! Open3D, pye57, Khronos' glTF validator.
 //!
 //! Each test writes a product with the core's writer and, beside it, what it should hold (`expected.json` and
 //! raw numbers); a script in `readers/` opens the product with the foreign program and compares.
 
-use std::path::{Path, PathBuf};
-use std::process::Command;
+use std::path::Path;
 
 use nalgebra::{Point3, Vector3};
 use serde_json::json;
 use stria_core::depth_map::{GridMap, MapGeometry, MapReader};
+use stria_core::export::cloud_laz::CloudLazWriter;
 use stria_core::export::cloud_ply::CloudPlyWriter;
+use stria_core::export::depth_tif::section::Cut;
 use stria_core::export::manifest::{self, Manifest, Quality, SCHEMA_VERSION};
 use stria_core::export::npy::NpyWriter;
 use stria_core::export::preview::{self, PreviewText};
 use stria_core::export::tiles::{TileGrid, TileWriter};
 use stria_core::export::trajectory_csv::{TrajectoryRow, TrajectoryWriter};
-use stria_core::export::{depth_png, depth_tif, texture};
+use stria_core::export::{cloud_e57, cloud_pcd, depth_png, depth_tif, mesh_glb, section_csv, texture};
 use stria_core::geometry::world_from_camera;
 use stria_core::surface::SurfacePoint;
+use stria_tests::support::readers::{python_program, read_with_node, run};
 use tempfile::TempDir;
 
 fn read_with(script: &str, folder: &Path) {
-    let root = PathBuf::from(env!("CARGO_MANIFEST_DIR")).join("..");
-    let python = root.join("target/python/bin/python");
-    assert!(python.exists(), "{} is missing: `make setup` installs it", python.display());
-    let output =
-        Command::new(&python).arg(root.join("tests/readers").join(script)).arg(folder).output().expect("Python starts");
-    let text = |bytes: &[u8]| String::from_utf8_lossy(bytes).into_owned();
-    assert!(output.status.success(), "{script}:\n{}{}", text(&output.stdout), text(&output.stderr));
+    let script = Path::new(env!("CARGO_MANIFEST_DIR")).join("readers").join(script);
+    run(python_program("python"), &[script.to_str().expect("a path"), folder.to_str().expect("a path")]);
 }
 
 fn folder() -> TempDir {
@@ -97,27 +95,118 @@ fn tiles_hold_the_map() {
     read_with("tiles.py", folder.path());
 }
 
-#[test]
-fn cloud_ply_holds_the_points() {
-    let folder = folder();
-    let mut writer = CloudPlyWriter::create(&folder.path().join("cloud.ply")).expect("create");
-    let mut expected = Vec::new();
-    for i in 0..3210_u32 {
+fn points() -> impl Iterator<Item = SurfacePoint> {
+    (0..3210_u32).map(|i| {
         let t = f64::from(i);
-        let point = SurfacePoint {
+        SurfacePoint {
             point_in_world: Point3::new(t * 0.25, -40.0 + t * 0.125, 850.0 + (t * 0.01).sin()),
             rgb: [i as u8, (i / 256) as u8, 200],
             confidence: (i % 100) as f32 / 128.0,
             frame: i / 700,
-        };
+        }
+    })
+}
+
+fn write_points(folder: &Path) {
+    let point = |point: SurfacePoint| {
         let [x, y, z] = [point.point_in_world.x, point.point_in_world.y, point.point_in_world.z];
         let [red, green, blue] = point.rgb;
-        expected.push(json!([x, y, z, red, green, blue, point.confidence, point.frame]));
-        writer.push(&point).expect("push");
-    }
+        json!([x, y, z, red, green, blue, point.confidence, point.frame])
+    };
+    write_json(folder, json!({ "points": points().map(point).collect::<Vec<_>>() }));
+}
+
+#[test]
+fn cloud_ply_holds_the_points() {
+    let folder = folder();
+    let mut writer = CloudPlyWriter::create(&folder.path().join("cloud.ply")).expect("create");
+    points().for_each(|point| writer.push(&point).expect("push"));
     writer.finish().expect("finish");
-    write_json(folder.path(), json!({ "points": expected }));
+    write_points(folder.path());
     read_with("cloud_ply.py", folder.path());
+}
+
+#[test]
+fn clouds_for_other_programs_hold_the_points() {
+    let folder = folder();
+    let path = |name: &str| folder.path().join(name);
+    let mut writer = CloudLazWriter::create(&path("cloud.laz")).expect("create");
+    points().for_each(|point| writer.push(&point).expect("push"));
+    writer.finish().expect("finish");
+    cloud_pcd::write(&path("cloud.pcd"), 3210, points().map(Ok)).expect("PCD");
+    cloud_e57::write(&path("cloud.e57"), "known cloud", 3210, points().map(Ok)).expect("E57");
+    write_points(folder.path());
+    for script in ["cloud_laz.py", "cloud_pcd.py", "cloud_e57.py"] {
+        read_with(script, folder.path());
+    }
+}
+
+/// A product folder's map and tiles; the map has holes and a ragged edge.
+fn map_and_tiles(folder: &Path) -> GridMap {
+    let mut map = map(folder);
+    depth_tif::write(&mut map, &folder.join("depth.tif")).expect("write");
+    let grid = TileGrid { x0_mm: -544.25 + 75.0, y0_mm: -305.5 + 3.5, mm_per_px: 0.5 };
+    TileWriter::create(folder, grid).expect("create").finish(&mut map).expect("finish");
+    map
+}
+
+#[test]
+fn the_mesh_is_valid_gltf_where_the_wall_is() {
+    let folder = folder();
+    let map = map_and_tiles(folder.path());
+    let path = folder.path().join("wall.glb");
+    let facts = mesh_glb::write(&path, folder.path(), 250_000).expect("a mesh");
+    // Half size: 651 x 306 px, less the hole of 45 x 27.
+    assert!((190_000..199_206).contains(&facts.vertices) && facts.textured && facts.mm_per_vertex == 1.0, "{facts:?}");
+    let report = read_with_node("gltf.mjs", &path);
+    let issues = &report["issues"];
+    assert_eq!((&issues["numErrors"], &issues["numWarnings"]), (&json!(0), &json!(0)), "{issues}");
+    assert_eq!(report["info"]["totalVertexCount"], facts.vertices);
+    assert_eq!(report["info"]["totalTriangleCount"], facts.triangles);
+    assert_eq!(report["info"]["hasTextures"], true, "{}", report["info"]);
+    let g = map.geometry();
+    let end = |start: f64, count: usize| start + (count - 1) as f64 * g.mm_per_px;
+    let near = |value: &serde_json::Value, expected_mm: f64| {
+        let found_mm = value.as_f64().unwrap_or(f64::NAN) * 1000.0;
+        assert!((found_mm - expected_mm).abs() <= 1.01, "{found_mm} is not {expected_mm} mm: {report}");
+    };
+    // x along the travel; y up; z towards who looks.
+    near(&report["low"][0], g.x0_mm);
+    near(&report["high"][0], end(g.x0_mm, g.width_px));
+    near(&report["low"][1], -end(g.y0_mm, g.height_px));
+    near(&report["high"][1], -g.y0_mm);
+    let depths = || map.pixels().depth_mm.iter().filter(|z| z.is_finite()).map(|z| f64::from(*z));
+    near(&report["high"][2], -depths().fold(f64::INFINITY, f64::min));
+    near(&report["low"][2], -depths().fold(f64::NEG_INFINITY, f64::max));
+    let whole = mesh_glb::write(&path, folder.path(), 1_000_000).expect("a mesh");
+    assert!(whole.mm_per_vertex == 0.5 && whole.vertices > 3 * facts.vertices, "{whole:?}");
+}
+
+#[test]
+fn a_section_is_the_map_s_own_pixels() {
+    let folder = folder();
+    let map = map_and_tiles(folder.path());
+    let (tif, path) = (folder.path().join("depth.tif"), folder.path().join("section.csv"));
+    let chainage_mm = |x_mm: f64| 10_000.0 - x_mm;
+    let across = Cut::Across { x_mm: -544.25 + 310.0 * 0.5 };
+    let (measured, rows) = section_csv::write(&path, &tif, across, chainage_mm).expect("a section");
+    assert_eq!((measured, rows), (611 - 55, 611), "the hole is empty");
+    let text = std::fs::read_to_string(&path).expect("read");
+    let mut lines = text.lines();
+    assert_eq!(lines.next(), Some("distance_mm,chainage_mm,x_mm,y_mm,z_mm"));
+    for (row, line) in lines.enumerate() {
+        let fields: Vec<&str> = line.split(',').collect();
+        let places: Vec<f64> = fields[..4].iter().map_while(|field| field.parse().ok()).collect();
+        assert_eq!(places, [row as f64 * 0.5, 10_389.25, -389.25, -305.5 + row as f64 * 0.5]);
+        let z_mm = map.pixels().depth_mm[row * 1301 + 310];
+        assert_eq!(fields[4].parse().ok(), z_mm.is_finite().then_some(z_mm), "{line}");
+    }
+    let slanted = Cut::Line { from_mm: [-500.0, -300.0], to_mm: [100.0, -1.0] };
+    let (measured, rows) = section_csv::write(&path, &tif, slanted, chainage_mm).expect("a section");
+    assert!(rows > 1201 && measured > 1000, "{measured} of {rows}");
+    let beside = Cut::Line { from_mm: [5000.0, 0.0], to_mm: [5000.0, 100.0] };
+    let refused = section_csv::write(&path, &tif, beside, chainage_mm).expect_err("beside the map").to_string();
+    assert!(refused.contains("chainage from 10544.2"), "{refused}");
 }
 
 #[test]
@@ -177,6 +266,7 @@ fn manifest_json_lists_what_is_there() {
         resolution: None,
         quality: Quality::default(),
         gaps: Vec::new(),
+        recordings: Vec::new(),
         warnings: Vec::new(),
         timings_s: Default::default(),
         products: manifest::list_products(folder.path()).expect("list"),

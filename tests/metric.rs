@@ -45,6 +45,7 @@ fn measure(scene: Scene, seconds: f64, fps: f64, seed: u64, laser_on: impl Fn(u3
     let out_dir = folder.path().join("out");
     let request = Request {
         source: video,
+        topics: Vec::new(),
         source_name: "video.mp4".into(),
         fps: None,
         poses: None,

@@ -4,6 +4,5 @@
 mod recording_archive {
     mod archive;
     mod known_run;
-    mod readers;
     mod recording;
 }

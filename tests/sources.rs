@@ -30,6 +30,7 @@ fn process_source(source: &Path, rig: &Rig) -> Result<Manifest> {
     let out_dir = folder.path().join("products");
     let request = Request {
         source: source.to_path_buf(),
+        topics: Vec::new(),
         source_name: source.file_name().expect("a name").to_string_lossy().into_owned(),
         fps: None,
         recorded_at: jiff::Timestamp::UNIX_EPOCH,

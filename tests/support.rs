@@ -3,6 +3,7 @@
 pub mod cluster;
 pub mod form;
 pub mod postgres;
+pub mod readers;
 pub mod s3;
 pub mod server;
 
@@ -52,7 +53,11 @@ pub struct Run {
 }
 
 impl Run {
-    fn simulate(seconds: &str, fps: &str, size: &str) -> Run {
+    /// A run along a wall.
+    ///
+    /// # Panics
+    /// Where it cannot be simulated.
+    pub fn simulate(seconds: &str, fps: &str, size: &str) -> Run {
         let folder = tempfile::tempdir().expect("a temporary folder");
         let out = folder.path().join("run");
         let text = out.to_str().expect("a plain path");

@@ -6,16 +6,21 @@
 
 pub mod archive_mcap;
 pub(crate) mod canvas;
+pub mod cloud_e57;
+pub mod cloud_laz;
+pub mod cloud_pcd;
 pub mod cloud_ply;
 pub mod depth_png;
 pub mod depth_tif;
 pub mod live_frame;
 pub mod manifest;
+pub mod mesh_glb;
 pub mod new_file;
 pub mod npy;
 pub mod parts;
 pub mod preview;
 mod pyramid;
+pub mod section_csv;
 pub mod texture;
 pub mod tiles;
 pub mod trajectory_csv;

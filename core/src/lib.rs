@@ -23,6 +23,7 @@ pub mod depth_map;
 pub mod error;
 pub mod export;
 pub mod geometry;
+pub mod mcap_file;
 pub mod motion;
 pub mod pipeline;
 pub mod recipe;

@@ -1,7 +1,9 @@
 //! The order of the stages: a source in, products out. Progress leaves as events; a stop comes back.
 
+mod archiving;
 mod colours;
 mod folder;
+mod laz;
 mod metric;
 mod paper;
 mod poses;
@@ -26,7 +28,7 @@ use crate::export::manifest::Manifest;
 use crate::motion::track::TrackUse;
 use crate::recipe::{Method, Recipe};
 use crate::rig::Rig;
-use crate::source::{self, Image, Source, SourceInfo};
+use crate::source::{self, Beside, Image, Source, SourceInfo};
 use crate::stripe::Stripe;
 use crate::surface::Placed;
 use folder::ProductFolder;
@@ -46,7 +48,7 @@ pub enum ProductGroup {
     Preview,
     /// `tiles/`.
     Tiles,
-    /// `cloud.ply`.
+    /// `cloud.ply`, `cloud.laz`.
     Cloud,
     /// `trajectory.csv`.
     Trajectory,
@@ -72,8 +74,10 @@ impl ProductGroup {
 
 /// What to process, with what, into where.
 pub struct Request {
-    /// A video file or a folder of images.
+    /// A video file, a folder of images or an MCAP file.
     pub source: PathBuf,
+    /// The topics of an MCAP file to read; of those that are not named a guess is made.
+    pub topics: Vec<String>,
     /// The name of the source in messages and the manifest (an uploaded file's own name).
     pub source_name: String,
     /// Frames a second of a folder of images.
@@ -98,8 +102,12 @@ pub struct Request {
 
 impl Request {
     /// What the given poses are for; `None` where there are none.
-    fn track_use(&self) -> Option<TrackUse> {
-        self.poses.as_ref().map(|_| self.recipe.pose.track)
+    fn track_use(&self, beside: &Beside) -> Option<TrackUse> {
+        match &self.poses {
+            Some(_) => Some(self.recipe.pose.track),
+            // A robot's odometry drifts and slips: it says where to look, never where the camera was.
+            None => (self.recipe.method == Method::Metric && !beside.poses.is_empty()).then_some(TrackUse::Prior),
+        }
     }
 
     /// The publication's way measures in pixels: it has no place for a pose.
@@ -165,25 +173,47 @@ pub type Observer<'a> = dyn FnMut(Event) -> std::ops::ControlFlow<()> + 'a;
 /// says stop. Whatever was written is then removed again.
 pub fn process(request: &Request, observer: &mut Observer<'_>) -> Result<Manifest> {
     request.check_poses()?;
-    let source = source::open(&request.source, &request.source_name, request.fps)?;
+    let source = source::open_topics(&request.source, &request.source_name, request.fps, &request.topics)?;
     let info = source.info().clone();
+    let beside = source.beside();
     request.rig.check_image_size(&request.source_name, info.width_px, info.height_px)?;
     let folder = ProductFolder::claim(&request.out_dir)?;
     let mut progress = Progress::new(observer, info.frames_announced, request.products.len() + 1);
-    let manifest = measure_and_write(request, source, &info, &mut progress);
+    let manifest = warn_of_camera(request, &beside, &mut progress)
+        .and_then(|()| measure_and_write(request, source, &info, &beside, &mut progress));
     folder.settle(manifest)
+}
+
+/// How far a focal length that the source gives may be from the rig's, as a share.
+const FOCAL_TOLERANCE: f64 = 0.02;
+
+/// A camera that says of itself what the rig does not: perhaps the rig is another run's.
+fn warn_of_camera(request: &Request, beside: &Beside, progress: &mut Progress<'_, '_>) -> Result<()> {
+    let Some(given) = &beside.camera else { return Ok(()) };
+    let camera = &request.rig.camera;
+    let off = [(given.focal_px[0], camera.fx_px), (given.focal_px[1], camera.fy_px)]
+        .into_iter()
+        .any(|(given_px, rig_px)| given_px > 0.0 && (given_px / rig_px - 1.0).abs() > FOCAL_TOLERANCE);
+    if !off {
+        return Ok(());
+    }
+    progress.warn(format!(
+        "{} gives focal lengths of {:.1} and {:.1} px, the rig {:.1} and {:.1} px: check that the rig is this run's",
+        given.topic, given.focal_px[0], given.focal_px[1], camera.fx_px, camera.fy_px
+    ))
 }
 
 fn measure_and_write(
     request: &Request,
     source: Box<dyn Source>,
     info: &SourceInfo,
+    beside: &Beside,
     progress: &mut Progress<'_, '_>,
 ) -> Result<Manifest> {
-    let mut products = Products::create(request, info)?;
-    let mut quality = QualityCounter::new(request.track_use());
-    let mut run =
-        Run { request, products: &mut products, quality: &mut quality, progress, timings: Timings::default() };
+    let mut products = Products::create(request, info, beside)?;
+    let mut quality = QualityCounter::new(request.track_use(beside));
+    let timings = Timings::default();
+    let mut run = Run { request, beside, products: &mut products, quality: &mut quality, progress, timings };
     match request.recipe.method {
         Method::Metric => metric::measure(&mut run, source)?,
         Method::Paper => paper::measure(&mut run, source)?,
@@ -195,6 +225,7 @@ fn measure_and_write(
 /// A job at work: what every stage's results go to.
 struct Run<'a, 'r, 'o, 'p> {
     request: &'r Request,
+    beside: &'a Beside,
     products: &'a mut Products<'r>,
     quality: &'a mut QualityCounter,
     progress: &'a mut Progress<'o, 'p>,

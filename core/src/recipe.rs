@@ -250,6 +250,9 @@ recipe! {
         images_per_s: f64 = 5.0, "1/s", number(0.1, 240.0);
         /// Surface points recorded of each profile, at most.
         points_per_profile: u32 = 240, "", whole(8, 8192);
+        /// Of a run whose recording becomes sparse, each stretch of this length gets a dense recording of its own, within
+        /// the same budget; 0: none.
+        stretch_m: f64 = 50.0, "m", number(0.0, 100000.0);
         /// Longest time between two live segments.
         segment_s: f64 = 1.0, "s", number(0.1, 60.0);
     }

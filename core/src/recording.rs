@@ -10,7 +10,8 @@
 //!
 //! The recording keeps within `recording.budget_mb` however long the run is: images and points become sparser as
 //! their shares fill; the plots keep every frame until their own share fills and are then means over 2, 4, 8 …
-//! frames.
+//! frames. Of a run that is too long for it, [`Recordings`] also writes dense recordings of stretches of
+//! `recording.stretch_m`.
 
 mod blueprint;
 mod budget;
@@ -19,6 +20,7 @@ mod data;
 mod images;
 mod rows;
 mod store;
+mod stretches;
 mod surface;
 
 use std::path::Path;
@@ -29,6 +31,7 @@ use nalgebra::Point3;
 use rerun::{EncodedImage, Points3D, StoreId, StoreKind, TextDocument, TextLog, ViewCoordinates};
 
 pub use self::store::Segment;
+pub use self::stretches::Recordings;
 
 use self::budget::Budget;
 use self::data::{Moment, fixed, row};
@@ -183,6 +186,11 @@ impl Recorder {
     fn push_guide(&mut self) -> Result<()> {
         let text = blueprint::guide(&self.rig, &self.run_name, self.surface.range());
         self.store.push(fixed(entity::GUIDE, &TextDocument::new(text).with_media_type("text/markdown"))?)
+    }
+
+    /// Whether the recording shows less of the surface than every profile that was asked for.
+    fn is_sparse(&self) -> bool {
+        self.budget.surface.halvings() > 0
     }
 
     /// Whether [`Recorder::log_frame`] would show the image of a frame at this time; if not, it needs neither the

@@ -4,6 +4,7 @@ mod backup;
 mod bearer;
 mod calibrate;
 mod engine;
+mod export;
 mod inspect;
 mod logging;
 mod process;
@@ -38,6 +39,7 @@ enum Command {
     Backup(backup::Backup),
     Restore(backup::Restore),
     Send(send::Send),
+    Export(export::Export),
     Inspect(inspect::Inspect),
     /// Prints the OpenAPI document of the HTTP interface.
     #[command(hide = true)]
@@ -90,6 +92,7 @@ pub fn run() -> ExitCode {
         Command::Backup(command) => command.run(),
         Command::Restore(command) => command.run(),
         Command::Send(command) => command.run(),
+        Command::Export(command) => command.run(),
         Command::Inspect(command) => command.run(),
         Command::Openapi => print_openapi(),
     };

@@ -2,6 +2,7 @@
 //!
 //! Handlers meet the workers only in the records, the queue and the store.
 
+mod archive;
 mod batches;
 pub mod connection;
 mod document;
@@ -119,11 +120,11 @@ fn routes() -> OpenApiRouter<App> {
         .routes(routes!(jobs::get_product))
         .routes(routes!(recording::get_recording))
         .routes(routes!(recording::get_segment))
-        .routes(routes!(jobs::get_archive))
         .routes(routes!(measure::get_profile))
         .routes(routes!(measure::get_trajectory))
         .routes(routes!(growing::get_tile))
         .routes(routes!(growing::get_live_frame))
+        .routes(routes!(archive::get_archive))
         .routes(routes!(rigs::list_rigs, rigs::create_rig))
         .routes(routes!(rigs::get_rig))
         .routes(routes!(lists::list_assets))

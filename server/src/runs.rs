@@ -10,7 +10,7 @@ use sea_orm::{ActiveValue::Set, ColumnTrait, ConnectionTrait, EntityTrait, Query
 
 use serde::{Deserialize, Serialize};
 
-pub use jobs::content_type;
+pub use jobs::{StoredFile, content_type};
 pub use listing::{Page, RunFilter, RunSort};
 pub use rigs::{RecipeText, RigText, built_in_recipes, options};
 

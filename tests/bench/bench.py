@@ -9,7 +9,8 @@ WORK/bench.md (tables ready for the README) and WORK/bench.json (every figure):
 - speed: frames/s of bare decoding, of each method with few and with all products, and of the yardstick (the publication
   in plain Python and OpenCV), in interleaved rounds; and the time per stage;
 - memory: peak for 1 and for 10 minutes of video;
-- accuracy: both methods over all scenes against their truth.
+- accuracy: both methods over all scenes against their truth;
+- exports: the archive's size; time, size and memory of a 30-minute run's cloud in each format.
 """
 
 import argparse
@@ -31,6 +32,7 @@ try:
 except ImportError as missing:
     sys.exit(f"{missing}: the bench needs tests/requirements.txt; `make setup` installs it into target/python")
 
+from bench_exports import exports, exports_table
 from bench_runs import SCENES, Bench, BenchError, Scene, call, say
 from bench_tables import Table, accuracy_tables, memory_table, speed_table, stages_table
 
@@ -39,7 +41,7 @@ SPEED_SCENES = ("pipe", "wall")
 MEMORY_SCENE = "wall"
 BUSY_SHARE = 0.1
 """Other programs that take more of the processor than this are mentioned."""
-PARTS = ("speed", "memory", "accuracy")
+PARTS = ("speed", "memory", "accuracy", "exports")
 
 
 def speed(bench: Bench, scenes: list[Scene], methods: list[str], rounds: int) -> dict:
@@ -146,6 +148,8 @@ def report(work: Path, results: dict, straight: bool) -> list[Table]:
         tables += [speed_table(results["speed"]), stages_table(results["speed"])]
     if results.get("memory"):
         tables.append(memory_table(results["memory"], straight))
+    if results.get("exports"):
+        tables.append(exports_table(results["exports"]))
     if results.get("accuracy"):
         tables += accuracy_tables(results["accuracy"])
     (work / "bench.json").write_text(json.dumps(results, indent=2))
@@ -211,6 +215,9 @@ def main() -> None:
         report(options.work, results, options.straight)
     if "memory" not in skip:
         results["memory"] = memory(bench, by_name[MEMORY_SCENE], methods, lengths_s, options.straight)
+        report(options.work, results, options.straight)
+    if "exports" not in skip:
+        results["exports"] = exports(bench, by_name[MEMORY_SCENE], 3 if options.quick else 30)
     tables = report(options.work, results, options.straight)
     print("{processor}, {cores} cores, {memory_gb} GB, {software}, FFmpeg {ffmpeg}".format(**results["machine"]))
     print("\n".join(["", *notes, *(table.text() for table in tables)]))

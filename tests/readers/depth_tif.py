@@ -3,6 +3,7 @@
 import numpy as np
 import rasterio
 import tifffile
+from rio_cogeo.cogeo import cog_validate
 from expected import FOLDER, depth_mm, halved, map_geometry
 
 
@@ -41,6 +42,8 @@ def check_order(pages):
 
 def check_gdal(path):
     geometry = map_geometry()
+    valid, errors, warnings = cog_validate(str(path), strict=True)
+    assert valid and not errors and not warnings, (errors, warnings)
     with rasterio.open(path) as data:
         np.testing.assert_array_equal(data.read(1), depth_mm())
         assert np.isnan(data.nodata) and data.units == ("mm",) and data.dtypes == ("float32",)

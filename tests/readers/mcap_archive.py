@@ -67,16 +67,49 @@ def grid(message):
     }
 
 
+def image32(message):
+    z = np.frombuffer(message.data, "<f4").reshape(message.height, message.step // 4)
+    return {"encoding": message.encoding, "shape": list(z.shape), "last": float(z[-1, -1])}
+
+
+def scene(message):
+    def entity(e):
+        (cube,), (text,) = e.cubes, e.texts
+        p, s = cube.pose.position, cube.size
+        return {
+            "id": e.id,
+            "frame_id": e.frame_id,
+            "text": text.text,
+            "position": [p.x, p.y, p.z],
+            "size": [s.x, s.y, s.z],
+            "metadata": {pair.key: pair.value for pair in e.metadata},
+        }
+
+    return {"entities": [entity(e) for e in message.entities]}
+
+
+def stamps(message):
+    for part in ("transforms", "entities"):
+        if hasattr(message, part):
+            return getattr(message, part)[0].timestamp
+    return message.timestamp
+
+
 def describe(topic, message):
     if topic in ("/surface", "/profile"):
         return cloud(message)
+    if topic == "/defects":
+        return scene(message)
+    if topic == "/depth_map/image":
+        return image32(message)
     if topic.startswith("/depth_map"):
         return grid(message)
     if topic == "/tf":
-        t, r = message.translation, message.rotation
+        (transform,) = message.transforms
+        t, r = transform.translation, transform.rotation
         return {
-            "parent": message.parent_frame_id,
-            "child": message.child_frame_id,
+            "parent": transform.parent_frame_id,
+            "child": transform.child_frame_id,
             "translation": [t.x, t.y, t.z],
             "rotation": [r.x, r.y, r.z, r.w],
         }
@@ -118,7 +151,7 @@ def main(path, video_out=None):
                 content = json.loads(message.data)
             else:
                 content = DecoderFactory().decoder_for(channel.message_encoding, schema)(message.data)
-                stamp = content.timestamp
+                stamp = stamps(content)
                 topic["stamps_ns"].append(stamp.seconds * 1_000_000_000 + stamp.nanos)
                 if channel.topic == "/camera/video" and video:
                     video.write(content.data)

@@ -9,7 +9,7 @@ use stria_core::recipe::Recipe;
 use stria_core::source::{EncodedFormat, EncodedFrame};
 
 use super::known_run::KnownRun;
-use super::readers::{read, run};
+use stria_tests::support::readers::{read, run};
 
 const START: &str = "2026-03-01T10:00:00.25Z";
 const START_NS: u64 = 1_772_359_200_250_000_000;
@@ -36,6 +36,7 @@ fn video_frames() -> Vec<EncodedFrame> {
     let ends = starts.iter().skip(1).copied().chain([stream.len()]);
     let frame = |(i, (start, end)): (usize, (&usize, usize))| EncodedFrame {
         time_s: i as f64 / FPS,
+        order_s: i as f64 / FPS,
         format: EncodedFormat::H264,
         key: i % 10 == 0,
         data: stream[*start..end].to_vec(),
@@ -75,7 +76,7 @@ fn an_archive_holds_the_run_at_its_capture_times() {
     let mut archive = writer(&path, &known);
     for index in 0..FRAMES {
         let frame = known.frame(index);
-        archive.measurement(index, frame.time_s, &frame.stripe, &frame.shift).expect("a measurement");
+        archive.measurement(index, frame.time_s, &frame.stripe, &frame.shift, &frame.points).expect("a measurement");
         archive.pose(frame.time_s, &frame.pose).expect("a pose");
         archive.profile(frame.time_s, &frame.profile, &frame.points).expect("a profile");
         archive.surface(frame.time_s, &frame.points).expect("points");
@@ -115,12 +116,14 @@ fn whole_file(read: &Value) {
     assert_eq!(read["statistics"]["chunks"], read["file"]["chunks"]);
     assert_eq!(read["statistics"]["start_ns"], START_NS);
     assert_eq!(read["statistics"]["end_ns"], time_ns(u64::from(FRAMES) - 1));
-    assert_eq!(read["statistics"]["messages"], 5 * FRAMES + 2);
+    assert_eq!(read["statistics"]["messages"], 4 * FRAMES + 3 + 2);
     for (name, topic) in read["topics"].as_object().expect("topics") {
         let times = array(&topic["times_ns"]);
         let expected: Vec<Value> = match name.as_str() {
             "/camera/calibration" => vec![json!(START_NS)],
             "/log" => vec![json!(time_ns(5))],
+            // Half a second of the surface in each message, which has its last frame's time.
+            "/surface" => [13, 27, 39].map(|i| json!(time_ns(i))).to_vec(),
             _ => (0..u64::from(FRAMES)).map(|i| json!(time_ns(i))).collect(),
         };
         assert_eq!(*times, expected, "{name}");
@@ -156,18 +159,20 @@ fn results(read: &Value, known: &KnownRun) {
         near(&pose["translation"][0], f64::from(index) * 0.002, 1e-9);
         assert_eq!(pose["rotation"], json!([0.0, 0.0, 0.0, 1.0]));
 
-        for (topic, frame_id, point) in [
-            ("/surface", "world", frame.points[0].point_in_world),
-            ("/profile", "camera", frame.profile.points[0].point_in_camera),
+        let (chunk, points) = [(0, 14 * 180), (1, 14 * 180), (2, 12 * 180)][at / 14];
+        for (topic, at, frame_id, points, point) in [
+            ("/surface", chunk, "world", points, known.frame(14 * chunk as u32).points[0].point_in_world),
+            ("/profile", at, "camera", 180, frame.profile.points[0].point_in_camera),
         ] {
             let cloud = &topics[topic]["of"][at];
-            assert_eq!((&cloud["frame_id"], &cloud["points"]), (&json!(frame_id), &json!(180)));
+            assert_eq!((&cloud["frame_id"], &cloud["points"]), (&json!(frame_id), &json!(points)));
             assert_eq!(cloud["fields"], json!(["x", "y", "z", "red", "green", "blue", "alpha", "confidence"]));
             let expected = [point.x / 1e3, point.y / 1e3, point.z / 1e3, 120.0, 130.0, 140.0, 255.0, 0.8];
             array(&cloud["first"]).iter().zip(expected).for_each(|(value, e)| near(value, e, 1e-6));
         }
         let measured = &topics["/measurement"]["of"][at];
         assert_eq!((&measured["frame"], &measured["rows_found"]), (&json!(index), &json!(180)));
+        near(&measured["x_mm"], frame.points.iter().map(|p| p.point_in_world.x).sum::<f64>() / 180.0, 1e-9);
         match frame.shift.dx_px {
             Some(dx_px) => near(&measured["dx_px"], dx_px, 1e-12),
             None => assert!(measured.get("dx_px").is_none(), "not known is absent, not zero"),
@@ -182,7 +187,8 @@ fn single_images_become_compressed_images() {
     let path = dir.path().join("archive.mcap");
     let mut archive = writer(&path, &KnownRun::new(64, 48, FPS));
     for (i, format) in [EncodedFormat::Jpeg, EncodedFormat::Png, EncodedFormat::Webp].into_iter().enumerate() {
-        archive.frame(&EncodedFrame { time_s: i as f64, format, key: true, data: vec![7; 100 + i] }).expect("a frame");
+        let (time_s, data) = (i as f64, vec![7; 100 + i]);
+        archive.frame(&EncodedFrame { time_s, order_s: time_s, format, key: true, data }).expect("a frame");
     }
     archive.finish().expect("the end");
     let images = &read("mcap_archive.py", &[&path])["topics"]["/camera/image"];
@@ -201,7 +207,8 @@ fn a_small_map_is_one_grid_and_a_wide_one_comes_in_pieces() {
         let path = dir.path().join(format!("{width_px}.mcap"));
         let geometry = MapGeometry { x0_mm: 100.0, y0_mm: -50.0, mm_per_px: 0.5, width_px, height_px };
         let mut archive = writer(&path, &known);
-        archive.measurement(3, 0.12, &known.frame(3).stripe, &known.frame(3).shift).expect("a measurement");
+        let frame = known.frame(3);
+        archive.measurement(3, 0.12, &frame.stripe, &frame.shift, &frame.points).expect("a measurement");
         let mut largest = 0;
         let reader = |column: usize, row: usize, width: usize, height: usize| {
             largest = largest.max(width * height);
@@ -227,6 +234,15 @@ fn a_small_map_is_one_grid_and_a_wide_one_comes_in_pieces() {
         near(&first["origin"][0], 0.1 - 0.00025, 1e-12);
         near(&first["origin"][1], -0.05 - 0.00025, 1e-12);
         near(&first["cell"][0], 0.0005, 1e-12);
+        let image = &read["topics"]["/depth_map/image"];
+        assert_eq!((&image["schema"], &image["of"][0]["encoding"]), (&json!("foxglove.RawImage"), &json!("32FC1")));
+        let step = if pieces == 1 { 1 } else { 5 };
+        assert_eq!(image["of"][0]["shape"], json!([height_px / step, width_px / step]));
+        near(
+            &image["of"][0]["last"],
+            f64::from(whole.depth_mm[(height_px - step) * width_px + width_px - step]) / 1e3,
+            1e-6,
+        );
         let overview = &read["topics"]["/depth_map/overview"]["of"][0];
         if pieces == 1 {
             assert!(overview.is_null(), "one piece is its own overview");
@@ -238,6 +254,31 @@ fn a_small_map_is_one_grid_and_a_wide_one_comes_in_pieces() {
             near(&grids[1]["origin"][0], 0.1 - 0.00025 + width_m, 1e-9);
         }
     }
+}
+
+#[test]
+fn defects_are_boxes_where_they_are() {
+    let dir = tempfile::tempdir().expect("a folder");
+    let path = dir.path().join("archive.mcap");
+    let known = KnownRun::new(64, 48, FPS);
+    let mut archive = writer(&path, &known);
+    archive.surface(0.4, &known.frame(10).points).expect("points");
+    let bounds = json!({"x_min_mm": 100.0, "x_max_mm": 140.0, "y_min_mm": -30.0, "y_max_mm": -10.0});
+    let defect = json!({"id": 7, "kind": "missing_material", "severity": "severe", "chainage_mm": 2120.0, "z_mm": 812.0,
+        "depth_mm": 8.0, "area_mm2": 5.0, "bounds": bounds});
+    archive.defects(json!({"schema_version": 1, "defects": [defect]}).to_string().as_bytes()).expect("defects");
+    assert!(archive.defects(b"{}").is_err(), "another text is refused");
+    archive.finish().expect("the end");
+    let read = read("mcap_archive.py", &[&path]);
+    let topic = &read["topics"]["/defects"];
+    assert_eq!((&topic["schema"], &topic["times_ns"]), (&json!("foxglove.SceneUpdate"), &json!([time_ns(10)])));
+    let entity = &topic["of"][0]["entities"][0];
+    assert_eq!((&entity["id"], &entity["frame_id"]), (&json!("defect 7"), &json!("world")));
+    assert_eq!(entity["text"], "7 missing material: 8.0 mm");
+    for (value, expected) in [("position", [0.12, -0.02, 0.808]), ("size", [0.04, 0.02, 0.008])] {
+        array(&entity[value]).iter().zip(expected).for_each(|(found, expected)| near(found, expected, 1e-12));
+    }
+    assert_eq!(entity["metadata"]["chainage_mm"], "2120");
 }
 
 #[test]

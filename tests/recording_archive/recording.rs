@@ -4,10 +4,10 @@ use std::path::{Path, PathBuf};
 
 use serde_json::Value;
 use stria_core::recipe::RecordingOptions;
-use stria_core::recording::{RecordedRun, Recorder, Segment};
+use stria_core::recording::{RecordedRun, Recorder, Recordings, Segment};
 
 use super::known_run::KnownRun;
-use super::readers::read;
+use stria_tests::support::readers::read;
 
 const ENTITIES: [&str; 23] = [
     "depth_image",
@@ -242,4 +242,50 @@ fn a_recording_that_is_given_up_leaves_nothing() {
     let missing = dir.path().join("missing/recording.rrd");
     let error = Recorder::create(&options, &run.rig, &run_info(None, 30.0), &missing, None).err().expect("no folder");
     assert!(error.to_string().contains("missing"), "{error}");
+}
+
+#[test]
+fn a_long_run_has_dense_recordings_of_its_stretches() {
+    let dir = tempfile::tempdir().expect("a folder");
+    let run = KnownRun::new(160, 120, 60.0);
+    // 3,000 frames of 2 mm: six metres, of which the small budget shows every profile only for a while.
+    let options =
+        RecordingOptions { budget_mb: 5.0, image_width_px: 160, stretch_m: 2.0, ..RecordingOptions::default() };
+    let whole = dir.path().join("recording.rrd");
+    let info = run_info(Some(3000), run.fps);
+    let mut recordings = Recordings::create(&options, &run.rig, &info, &whole, None).expect("starts");
+    let mut frame = run.frame(1);
+    for index in 0..3000 {
+        (frame.index, frame.time_s, frame.pose) = (index, f64::from(index) / run.fps, run.pose(index));
+        recordings.log_frame(&frame.steps()).expect("a frame");
+    }
+    let (_, stretches) = recordings.finish().expect("the end");
+    assert_eq!(stretches.len(), 3, "{stretches:?}");
+    let first = read("rrd.py", &[&whole]);
+    let points =
+        |read: &Value| read["entities"]["world/surface"]["components"]["Points3D:positions"]["values"].as_u64();
+    let sparse = points(&first).expect("points") as f64 / 3000.0;
+    let mut next = 0;
+    for stretch in &stretches {
+        assert_eq!(stretch.first_frame, next, "one begins where the one before ended");
+        next = stretch.last_frame + 1;
+        assert!(stretch.to_x_mm - stretch.from_x_mm <= 2000.0, "{stretch:?}");
+        let path = dir.path().join(&stretch.name);
+        assert!(path.metadata().expect("a file").len() < 5_000_000);
+        let read = read("rrd.py", &[&path]);
+        assert_eq!(read["verify"]["ok"], true, "{}: {}", stretch.name, read["verify"]["output"]);
+        let frames = f64::from(stretch.last_frame - stretch.first_frame + 1);
+        assert!(points(&read).expect("points") as f64 / frames > 1.9 * sparse, "{} is no denser", stretch.name);
+    }
+    assert_eq!(next, 3000, "the last one reaches the end");
+    assert_eq!(names_in(dir.path()).len(), 4, "nothing half-made stays");
+    // A run that fits has one recording.
+    let short = tempfile::tempdir().expect("a folder");
+    let path = short.path().join("recording.rrd");
+    let options = RecordingOptions { stretch_m: 0.01, ..RecordingOptions::default() };
+    let mut recordings =
+        Recordings::create(&options, &run.rig, &run_info(Some(20), run.fps), &path, None).expect("starts");
+    (0..20).for_each(|index| drop(recordings.log_frame(&run.frame(index).steps()).expect("a frame")));
+    assert!(recordings.finish().expect("the end").1.is_empty());
+    assert_eq!(names_in(short.path()), ["recording.rrd"]);
 }

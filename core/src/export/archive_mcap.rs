@@ -5,35 +5,42 @@
 //! | `/camera/video` | foxglove.CompressedVideo | the frames as received, in decoding order |
 //! | `/camera/image` | foxglove.CompressedImage | the same for sources of single images |
 //! | `/camera/calibration` | foxglove.CameraCalibration | once, at the start |
-//! | `/tf` | foxglove.FrameTransform | `camera` in `world`, where it is known |
+//! | `/camera/raw` | foxglove.RawImage | the same for sources of pixels that are not packed |
+//! | `/tf` | foxglove.FrameTransforms | `camera` in `world`, where it is known |
 //! | `/profile` | foxglove.PointCloud | each frame's profile, in `camera` |
-//! | `/surface` | foxglove.PointCloud | each frame's part of the surface, in `world` |
-//! | `/measurement` | JSON | dx, dy, scale, residual, rows found |
+//! | `/surface` | foxglove.PointCloud | the surface in `world`, in chunks of some frames |
+//! | `/measurement` | JSON | dx, dy, scale, residual, rows found, where on the wall |
 //! | `/log` | foxglove.Log | warnings |
+//! | `/defects` | foxglove.SceneUpdate | a box around each defect, where defects were looked for |
 //! | `/depth_map` | foxglove.Grid | the finished map, in pieces of bounded size |
 //! | `/depth_map/overview` | foxglove.Grid | the same, sampled to one piece, where there are several |
+//! | `/depth_map/image` | foxglove.RawImage | the map as a 32FC1 image in metres; sampled where it is large |
 //!
 //! Lengths are metres, as the schemas want them; image positions and shifts are pixels. Every message's log time is
-//! its capture time: the run's start plus the frame's own time. Messages come in the order of the work, which readers
-//! sort by the file's index. `rig.toml`, `recipe.toml` and what the caller adds are attachments.
+//! its capture time: the run's start plus the frame's own time; a chunk of the surface has its last frame's. Only of
+//! a video with B-frames a frame's log time is that of its decoding, since players take messages by their log time and
+//! decoders want that order; the capture time is the message's `timestamp`. Messages come in the order of the work,
+//! which readers sort by the file's index. `rig.toml`, `recipe.toml` and what the caller adds are attachments: with the
+//! frames they are enough to run the job again.
 //!
 //! The messages and their schemas are the `foxglove` crate's. They are written with `mcap`'s own writer, not with
 //! that crate's, which tells nobody when the disk is full.
 
+mod cut;
 mod grid;
+mod points;
+mod scene;
 
 use std::collections::{BTreeMap, HashMap};
 use std::path::{Path, PathBuf};
 
-use foxglove::messages::packed_element_field::NumericType;
 use foxglove::messages::{
-    CameraCalibration, CompressedImage, CompressedVideo, FrameTransform, Log, PackedElementField, PointCloud, Pose,
-    Quaternion, Timestamp, Vector3, log::Level,
+    CameraCalibration, CompressedImage, CompressedVideo, FrameTransform, FrameTransforms, Log, Quaternion, RawImage,
+    Timestamp, Vector3, log::Level,
 };
 use foxglove::{Encode, Schema};
 use mcap::records::MessageHeader;
 use mcap::{Attachment, Compression, McapError, WriteOptions, Writer};
-use nalgebra::Point3;
 use serde::Serialize;
 
 use crate::depth_map::{MapGeometry, MapWindow};
@@ -43,10 +50,33 @@ use crate::geometry::WorldFromCamera;
 use crate::motion::Shift;
 use crate::recipe::Recipe;
 use crate::rig::Rig;
-use crate::source::{EncodedFormat, EncodedFrame};
+use crate::source::{EncodedFormat, EncodedFrame, VIDEO_METADATA, VideoFacts};
 use crate::stripe::Stripe;
 use crate::surface::SurfacePoint;
 use crate::triangulation::Profile;
+
+use points::cloud;
+
+pub use cut::{ArchiveCut, ArchiveSource, cut};
+
+/// Grows when something in an archive changes its meaning.
+const ARCHIVE_VERSION: &str = "2";
+/// A chunk of the surface holds at most about this many points ...
+const CHUNK_POINTS: usize = 32_768;
+/// ... and at most this long a stretch of the run, s.
+const CHUNK_S: f64 = 0.5;
+
+/// The topics that other parts of this room look for.
+mod topic {
+    pub(super) const VIDEO: &str = "/camera/video";
+    pub(super) const IMAGE: &str = "/camera/image";
+    pub(super) const RAW: &str = "/camera/raw";
+    pub(super) const TRANSFORMS: &str = "/tf";
+    pub(super) const PROFILE: &str = "/profile";
+    pub(super) const SURFACE: &str = "/surface";
+    pub(super) const MEASUREMENT: &str = "/measurement";
+    pub(super) const DEPTH_MAP: &str = "/depth_map";
+}
 
 /// Frame of reference of the profiles.
 const CAMERA: &str = "camera";
@@ -66,6 +96,11 @@ struct Measurement {
     scale: Option<f64>,
     #[serde(skip_serializing_if = "Option::is_none")]
     residual_px: Option<f64>,
+    /// Middle of the frame's points.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    x_mm: Option<f64>,
+    #[serde(skip_serializing_if = "Option::is_none")]
+    z_mm: Option<f64>,
 }
 
 const MEASUREMENT_SCHEMA: &str = r#"{
@@ -77,7 +112,9 @@ const MEASUREMENT_SCHEMA: &str = r#"{
     "dx_px": {"type": "number", "description": "shift of the image since the previous frame, columns"},
     "dy_px": {"type": "number", "description": "shift of the image since the previous frame, rows"},
     "scale": {"type": "number", "description": "scale of the image since the previous frame; above 1: came closer"},
-    "residual_px": {"type": "number", "description": "median distance of the corners from the fitted motion"}
+    "residual_px": {"type": "number", "description": "median distance of the corners from the fitted motion"},
+    "x_mm": {"type": "number", "description": "middle of the frame's points along the travel, world"},
+    "z_mm": {"type": "number", "description": "middle of the frame's points into the wall, world"}
   },
   "required": ["frame", "rows_found"]
 }"#;
@@ -95,7 +132,16 @@ pub struct ArchiveWriter {
     channels: HashMap<&'static str, Channel>,
     start_ns: u64,
     latest_s: f64,
+    chunk: Chunk,
     buffer: Vec<u8>,
+}
+
+/// Points of the surface that wait for being a message.
+#[derive(Default)]
+struct Chunk {
+    points: Vec<SurfacePoint>,
+    first_s: f64,
+    last_s: f64,
 }
 
 impl ArchiveWriter {
@@ -123,9 +169,10 @@ impl ArchiveWriter {
             channels: HashMap::new(),
             start_ns: u64::try_from(recorded_at.as_nanosecond()).unwrap_or(0),
             latest_s: 0.0,
+            chunk: Chunk::default(),
             buffer: Vec::new(),
         };
-        archive.metadata("stria", &[("version", env!("CARGO_PKG_VERSION")), ("archive_version", "1")])?;
+        archive.metadata("stria", &[("version", env!("CARGO_PKG_VERSION")), ("archive_version", ARCHIVE_VERSION)])?;
         archive.metadata("run", &[("name", run_name), ("recorded_at", &recorded_at.to_string())])?;
         archive.metadata(
             "units",
@@ -144,10 +191,20 @@ impl ArchiveWriter {
         Ok(archive)
     }
 
-    /// Adds a frame as the source holds it.
+    /// Says what the source's container says of its video; before the first frame.
     ///
     /// # Errors
     /// Where the file cannot be written; so for all that follow.
+    pub fn video(&mut self, facts: &VideoFacts) -> Result<()> {
+        let values = facts.metadata();
+        let values: Vec<(&str, &str)> = values.iter().map(|(name, value)| (name.as_str(), value.as_str())).collect();
+        self.metadata(VIDEO_METADATA, &values)
+    }
+
+    /// Adds a frame as the source holds it.
+    ///
+    /// # Errors
+    /// As [`ArchiveWriter::video`].
     pub fn frame(&mut self, frame: &EncodedFrame) -> Result<()> {
         let format = match frame.format {
             EncodedFormat::H264 => "h264",
@@ -157,23 +214,27 @@ impl ArchiveWriter {
             EncodedFormat::Jpeg => "jpeg",
             EncodedFormat::Png => "png",
             EncodedFormat::Webp => "webp",
+            EncodedFormat::Raw(layout) => layout.encoding.name(),
         };
         let timestamp = Some(self.timestamp(frame.time_s));
         let (frame_id, format, data) = (CAMERA.to_string(), format.to_string(), frame.data.clone().into());
         match frame.format {
-            EncodedFormat::H264 | EncodedFormat::H265 | EncodedFormat::Vp9 | EncodedFormat::Av1 => {
-                self.write("/camera/video", frame.time_s, &CompressedVideo { timestamp, frame_id, data, format })
+            video if video.is_video() => {
+                self.write(topic::VIDEO, frame.order_s, &CompressedVideo { timestamp, frame_id, data, format })
             }
-            EncodedFormat::Jpeg | EncodedFormat::Png | EncodedFormat::Webp => {
-                self.write("/camera/image", frame.time_s, &CompressedImage { timestamp, frame_id, data, format })
+            EncodedFormat::Raw(layout) => {
+                let (width, height, step) = (layout.width_px, layout.height_px, layout.step_bytes);
+                let image = RawImage { timestamp, frame_id, width, height, encoding: format, step, data };
+                self.write(topic::RAW, frame.time_s, &image)
             }
+            _ => self.write(topic::IMAGE, frame.time_s, &CompressedImage { timestamp, frame_id, data, format }),
         }
     }
 
     /// Adds where the camera was.
     ///
     /// # Errors
-    /// As [`ArchiveWriter::frame`].
+    /// As [`ArchiveWriter::video`].
     pub fn pose(&mut self, time_s: f64, world_from_camera: &WorldFromCamera) -> Result<()> {
         let t = world_from_camera.translation.vector / 1000.0;
         let q = world_from_camera.rotation.coords;
@@ -184,34 +245,62 @@ impl ArchiveWriter {
             translation: Some(Vector3 { x: t.x, y: t.y, z: t.z }),
             rotation: Some(Quaternion { x: q.x, y: q.y, z: q.z, w: q.w }),
         };
-        self.write("/tf", time_s, &transform)
+        self.write(topic::TRANSFORMS, time_s, &FrameTransforms { transforms: vec![transform] })
     }
 
     /// Adds a frame's profile, in the camera's frame.
     ///
     /// # Errors
-    /// As [`ArchiveWriter::frame`].
+    /// As [`ArchiveWriter::video`].
     pub fn profile(&mut self, time_s: f64, profile: &Profile, placed: &[SurfacePoint]) -> Result<()> {
         let points = profile.points.iter().zip(placed).map(|(p, s)| (p.point_in_camera, s.rgb, p.confidence));
         let cloud = cloud(self.timestamp(time_s), CAMERA, points);
-        self.write("/profile", time_s, &cloud)
+        self.write(topic::PROFILE, time_s, &cloud)
     }
 
-    /// Adds a frame's part of the surface, in the world.
+    /// Adds a frame's part of the surface, in the world; several frames become one message.
     ///
     /// # Errors
-    /// As [`ArchiveWriter::frame`].
+    /// As [`ArchiveWriter::video`].
     pub fn surface(&mut self, time_s: f64, points: &[SurfacePoint]) -> Result<()> {
-        let points = points.iter().map(|p| (p.point_in_world, p.rgb, p.confidence));
-        let cloud = cloud(self.timestamp(time_s), WORLD, points);
-        self.write("/surface", time_s, &cloud)
+        if self.chunk.points.is_empty() {
+            self.chunk.first_s = time_s;
+        }
+        self.chunk.points.extend_from_slice(points);
+        self.chunk.last_s = time_s;
+        self.latest_s = self.latest_s.max(time_s);
+        let full = self.chunk.points.len() >= CHUNK_POINTS || time_s - self.chunk.first_s >= CHUNK_S;
+        if full { self.write_chunk() } else { Ok(()) }
+    }
+
+    fn write_chunk(&mut self) -> Result<()> {
+        if self.chunk.points.is_empty() {
+            return Ok(());
+        }
+        let mut points = std::mem::take(&mut self.chunk.points);
+        let time_s = self.chunk.last_s;
+        let of = points.iter().map(|p| (p.point_in_world, p.rgb, p.confidence));
+        let cloud = cloud(self.timestamp(time_s), WORLD, of);
+        points.clear();
+        self.chunk.points = points;
+        self.write(topic::SURFACE, time_s, &cloud)
     }
 
     /// Adds what was measured in a frame.
     ///
     /// # Errors
-    /// As [`ArchiveWriter::frame`].
-    pub fn measurement(&mut self, frame: u32, time_s: f64, stripe: &Stripe, shift: &Shift) -> Result<()> {
+    /// As [`ArchiveWriter::video`].
+    pub fn measurement(
+        &mut self,
+        frame: u32,
+        time_s: f64,
+        stripe: &Stripe,
+        shift: &Shift,
+        points: &[SurfacePoint],
+    ) -> Result<()> {
+        let mean = |value: fn(&SurfacePoint) -> f64| {
+            (!points.is_empty()).then(|| points.iter().map(value).sum::<f64>() / points.len() as f64)
+        };
         let measurement = Measurement {
             frame,
             rows_found: stripe.found(),
@@ -219,16 +308,18 @@ impl ArchiveWriter {
             dy_px: shift.dy_px,
             scale: shift.scale,
             residual_px: shift.residual_px,
+            x_mm: mean(|p| p.point_in_world.x),
+            z_mm: mean(|p| p.point_in_world.z),
         };
         let json = serde_json::to_vec(&measurement).map_err(|e| Error::internal("archive", e))?;
         let schema = || Some(Schema::new("stria.Measurement", "jsonschema", MEASUREMENT_SCHEMA.as_bytes()));
-        self.put("/measurement", time_s, schema, "json", &json)
+        self.put(topic::MEASUREMENT, time_s, schema, "json", &json)
     }
 
     /// Adds something a person should know, at the time of the latest message.
     ///
     /// # Errors
-    /// As [`ArchiveWriter::frame`].
+    /// As [`ArchiveWriter::video`].
     pub fn warning(&mut self, text: &str) -> Result<()> {
         let log = Log {
             timestamp: Some(self.timestamp(self.latest_s)),
@@ -244,31 +335,49 @@ impl ArchiveWriter {
     /// width, height, px. No more than one piece of the map is in memory.
     ///
     /// # Errors
-    /// What `window` gives, and as [`ArchiveWriter::frame`].
+    /// What `window` gives, and as [`ArchiveWriter::video`].
     pub fn depth_map(
         &mut self,
         geometry: &MapGeometry,
         mut window: impl FnMut(usize, usize, usize, usize) -> Result<MapWindow>,
     ) -> Result<()> {
+        self.write_chunk()?;
         let (time_s, timestamp) = (self.latest_s, self.timestamp(self.latest_s));
         let mut overview = grid::Overview::new(geometry);
         let pieces = grid::pieces(geometry);
         for piece in &pieces {
             let content = window(piece.column_px, piece.row_px, piece.width_px, piece.height_px)?;
             overview.add(piece, &content);
-            self.write("/depth_map", time_s, &grid::message(timestamp, WORLD, &piece.geometry(geometry), &content))?;
+            self.write(
+                topic::DEPTH_MAP,
+                time_s,
+                &grid::message(timestamp, WORLD, &piece.geometry(geometry), &content),
+            )?;
         }
+        let (geometry, content) = overview.finish();
         if pieces.len() > 1 {
-            let (geometry, content) = overview.finish();
             self.write("/depth_map/overview", time_s, &grid::message(timestamp, WORLD, &geometry, &content))?;
         }
-        self.metadata("depth_map", &[("pieces", &pieces.len().to_string())])
+        self.write("/depth_map/image", time_s, &grid::image(timestamp, WORLD, &content))?;
+        let (pieces, step) = (pieces.len().to_string(), geometry.mm_per_px.to_string());
+        self.metadata("depth_map", &[("pieces", &pieces), ("image_mm_per_px", &step)])
+    }
+
+    /// Adds the defects that a `defects.json` lists, to be seen where they are, at the time of the latest message.
+    ///
+    /// # Errors
+    /// Another text; as [`ArchiveWriter::video`].
+    pub fn defects(&mut self, defects_json: &[u8]) -> Result<()> {
+        let scene: scene::DefectScene = serde_json::from_slice(defects_json)
+            .map_err(|e| Error::input("defects.json", e.to_string(), "a list of defects"))?;
+        let update = scene::update(self.timestamp(self.latest_s), WORLD, &scene);
+        self.write("/defects", self.latest_s, &update)
     }
 
     /// Adds a file.
     ///
     /// # Errors
-    /// As [`ArchiveWriter::frame`].
+    /// As [`ArchiveWriter::video`].
     pub fn attach(&mut self, name: &str, media_type: &str, bytes: &[u8]) -> Result<()> {
         let time = self.log_time(self.latest_s);
         let attachment = Attachment {
@@ -284,7 +393,7 @@ impl ArchiveWriter {
     /// Adds named values: hashes, versions.
     ///
     /// # Errors
-    /// As [`ArchiveWriter::frame`].
+    /// As [`ArchiveWriter::video`].
     pub fn metadata(&mut self, name: &str, values: &[(&str, &str)]) -> Result<()> {
         let metadata = values.iter().map(|(k, v)| (k.to_string(), v.to_string())).collect();
         let record = mcap::records::Metadata { name: name.into(), metadata };
@@ -294,8 +403,9 @@ impl ArchiveWriter {
     /// Completes the file with its index and puts it in its place. Without this call, nothing is left at the path.
     ///
     /// # Errors
-    /// As [`ArchiveWriter::frame`].
+    /// As [`ArchiveWriter::video`].
     pub fn finish(mut self) -> Result<()> {
+        self.write_chunk()?;
         self.writer.finish().map_err(|e| failed(&self.path, e))?;
         self.writer.into_inner().commit()
     }
@@ -373,55 +483,4 @@ fn failed(path: &Path, error: McapError) -> Error {
         McapError::Io(e) => Error::io(path, e),
         other => Error::internal("archive", other),
     }
-}
-
-/// A point cloud in metres: x y z (float32), red green blue alpha (uint8), confidence (float32).
-fn cloud(
-    timestamp: Timestamp,
-    frame_id: &str,
-    points: impl ExactSizeIterator<Item = (Point3<f64>, [u8; 3], f32)>,
-) -> PointCloud {
-    const STRIDE: usize = 20;
-    let mut data = Vec::with_capacity(STRIDE * points.len());
-    for (point, [r, g, b], confidence) in points {
-        metres(&point).iter().for_each(|v| data.extend(v.to_le_bytes()));
-        data.extend([r, g, b, 255]);
-        data.extend(confidence.to_le_bytes());
-    }
-    PointCloud {
-        timestamp: Some(timestamp),
-        frame_id: frame_id.into(),
-        pose: Some(pose_at([0.0; 3])),
-        point_stride: STRIDE as u32,
-        fields: fields(&[
-            ("x", 0, NumericType::Float32),
-            ("y", 4, NumericType::Float32),
-            ("z", 8, NumericType::Float32),
-            ("red", 12, NumericType::Uint8),
-            ("green", 13, NumericType::Uint8),
-            ("blue", 14, NumericType::Uint8),
-            ("alpha", 15, NumericType::Uint8),
-            ("confidence", 16, NumericType::Float32),
-        ]),
-        data: data.into(),
-    }
-}
-
-fn fields(of: &[(&str, u32, NumericType)]) -> Vec<PackedElementField> {
-    let field = |(name, offset, kind): &(&str, u32, NumericType)| PackedElementField {
-        name: (*name).into(),
-        offset: *offset,
-        r#type: i32::from(*kind),
-    };
-    of.iter().map(field).collect()
-}
-
-/// Not turned, at a position in metres.
-fn pose_at([x, y, z]: [f64; 3]) -> Pose {
-    Pose { position: Some(Vector3 { x, y, z }), orientation: Some(Quaternion { x: 0.0, y: 0.0, z: 0.0, w: 1.0 }) }
-}
-
-/// The schemas' unit of length.
-fn metres(point_mm: &Point3<f64>) -> [f32; 3] {
-    [point_mm.x, point_mm.y, point_mm.z].map(|v| (v / 1000.0) as f32)
 }

@@ -4,7 +4,9 @@
 //! number of points is known only at the end and then written into the header, whose length a comment keeps
 //! constant.
 
-use std::path::Path;
+use std::fs::File;
+use std::io::{BufReader, Read};
+use std::path::{Path, PathBuf};
 
 use crate::error::{Error, Result};
 use crate::export::new_file::NewFile;
@@ -79,28 +81,64 @@ fn header(points: u64) -> String {
     )
 }
 
-/// Reads a cloud that [`CloudPlyWriter`] wrote.
+/// Reads a cloud that [`CloudPlyWriter`] wrote, point by point.
+pub struct CloudPlyReader {
+    path: PathBuf,
+    file: BufReader<File>,
+    points: u64,
+    left: u64,
+}
+
+impl CloudPlyReader {
+    /// Opens a cloud.
+    ///
+    /// # Errors
+    /// Another header; another number of points than the header says.
+    pub fn open(path: &Path) -> Result<CloudPlyReader> {
+        let file = File::open(path).map_err(|e| Error::io(path, e))?;
+        let bytes = file.metadata().map_err(|e| Error::io(path, e))?.len();
+        let bad = |found: &str| Error::input(path.display().to_string(), found, "a cloud.ply of stria");
+        let mut file = BufReader::with_capacity(1 << 20, file);
+        let mut head = vec![0; header(0).len()];
+        file.read_exact(&mut head).map_err(|_| bad("no header"))?;
+        let text = std::str::from_utf8(&head).map_err(|_| bad("no header"))?;
+        let points: u64 = text
+            .lines()
+            .find_map(|line| line.strip_prefix("element vertex "))
+            .and_then(|count| count.parse().ok())
+            .ok_or_else(|| bad("no number of points"))?;
+        if header(points) != text {
+            return Err(bad("another header"));
+        }
+        if points.checked_mul(POINT_BYTES as u64) != bytes.checked_sub(head.len() as u64) {
+            return Err(bad("another number of points than its header says"));
+        }
+        Ok(CloudPlyReader { path: path.to_path_buf(), file, points, left: points })
+    }
+
+    /// The points in the file.
+    pub fn points(&self) -> u64 {
+        self.points
+    }
+}
+
+impl Iterator for CloudPlyReader {
+    type Item = Result<SurfacePoint>;
+
+    fn next(&mut self) -> Option<Self::Item> {
+        self.left = self.left.checked_sub(1)?;
+        let mut bytes = [0; POINT_BYTES];
+        let read = self.file.read_exact(&mut bytes);
+        Some(read.map(|()| point(&bytes)).map_err(|e| Error::io(&self.path, e)))
+    }
+}
+
+/// Reads a whole cloud.
 ///
 /// # Errors
-/// Another header; fewer points than the header says.
+/// As [`CloudPlyReader::open`].
 pub fn read(path: &Path) -> Result<Vec<SurfacePoint>> {
-    let bytes = std::fs::read(path).map_err(|e| Error::io(path, e))?;
-    let bad = |found: &str| Error::input(path.display().to_string(), found, "a cloud.ply of stria");
-    let head = header(0);
-    let text = bytes.get(..head.len()).and_then(|b| std::str::from_utf8(b).ok()).ok_or_else(|| bad("no header"))?;
-    let count: u64 = text
-        .lines()
-        .find_map(|line| line.strip_prefix("element vertex "))
-        .and_then(|count| count.parse().ok())
-        .ok_or_else(|| bad("no number of points"))?;
-    if header(count) != text {
-        return Err(bad("another header"));
-    }
-    let body = &bytes[head.len()..];
-    if body.len() as u64 != count * POINT_BYTES as u64 {
-        return Err(bad("another number of points than its header says"));
-    }
-    Ok(body.chunks_exact(POINT_BYTES).map(point).collect())
+    CloudPlyReader::open(path)?.collect()
 }
 
 fn point(bytes: &[u8]) -> SurfacePoint {
@@ -139,7 +177,9 @@ mod tests {
         assert_eq!(writer.points(), 1234);
         assert!(!path.exists(), "not before it is complete");
         writer.finish().expect("finish");
-        assert_eq!(read(&path).expect("read"), points);
+        let read = CloudPlyReader::open(&path).expect("opens");
+        assert_eq!(read.points(), 1234);
+        assert_eq!(read.collect::<Result<Vec<_>>>().expect("reads"), points);
     }
 
     #[test]
@@ -159,6 +199,7 @@ mod tests {
         writer.finish().expect("finish");
         let bytes = std::fs::read(&path).expect("read");
         std::fs::write(&path, &bytes[..bytes.len() - 1]).expect("cut");
-        assert!(read(&path).expect_err("cut").to_string().contains("another number of points"));
+        let refused = CloudPlyReader::open(&path).map(drop).expect_err("cut").to_string();
+        assert!(refused.contains("another number of points"), "{refused}");
     }
 }

@@ -10,6 +10,7 @@
 //! all readers obey: GDAL takes ModelPixelScale's y for its absolute value, by long custom.
 
 mod container;
+mod levels;
 pub mod section;
 
 use std::fs::File;
@@ -25,6 +26,8 @@ use crate::export::new_file::{self, NewFile};
 use crate::export::pyramid::{self, Layout};
 
 use container::{Container, Entry, Value};
+
+pub use levels::{LevelDepths, level_of_at_most};
 
 /// Side of a tile, px.
 const SIDE_PX: usize = 512;

@@ -111,6 +111,21 @@ pub struct Gap {
     pub reason: String,
 }
 
+/// A dense recording of a part of a run.
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+pub struct Stretch {
+    /// The file's name beside the recording of the whole.
+    pub name: String,
+    /// The smallest world x of the camera in it, mm.
+    pub from_x_mm: f64,
+    /// The largest world x of the camera in it, mm.
+    pub to_x_mm: f64,
+    /// First frame.
+    pub first_frame: u32,
+    /// Last frame.
+    pub last_frame: u32,
+}
+
 /// `manifest.json`.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 pub struct Manifest {
@@ -138,6 +153,9 @@ pub struct Manifest {
     pub quality: Quality,
     /// Stretches without data.
     pub gaps: Vec<Gap>,
+    /// Dense recordings of stretches of a long run, beside the one of the whole.
+    #[serde(default)]
+    pub recordings: Vec<Stretch>,
     /// What a person should know.
     pub warnings: Vec<String>,
     /// Seconds of work per stage.
@@ -239,6 +257,7 @@ mod tests {
             resolution: None,
             quality: Quality::default(),
             gaps: Vec::new(),
+            recordings: Vec::new(),
             warnings: vec!["a \"quoted\" name".into()],
             timings_s: BTreeMap::from([("stripe".into(), 1.5)]),
             products,

@@ -130,6 +130,13 @@ impl PoseTrack {
         Ok(PoseTrack { by_frame: reader.columns.frame.is_some(), rows: with_rotations(rows, line) })
     }
 
+    /// A track of poses at times since the run's first frame, s, which must not fall.
+    pub fn from_times(poses: impl IntoIterator<Item = (f64, WorldFromCamera)>) -> PoseTrack {
+        let row =
+            |(at, world_from_camera)| Row { at, pose: Some(GivenPose { world_from_camera, degrees_of_freedom: 6 }) };
+        PoseTrack { by_frame: false, rows: poses.into_iter().map(row).collect() }
+    }
+
     /// The pose at a frame that was captured `time_s` after the first one; `None` where the track does not know it.
     ///
     /// By number exactly; by time between the rows before and after, the position on the straight way and the

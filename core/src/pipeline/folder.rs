@@ -17,6 +17,13 @@ pub(super) struct ProductFolder {
 impl ProductFolder {
     /// Takes a folder: a new or empty one, or one that an interrupted job left behind, which is emptied.
     pub(super) fn claim(path: &Path) -> Result<ProductFolder> {
+        if path.exists() && !path.is_dir() {
+            return Err(Error::input(
+                path.display().to_string(),
+                "not a folder",
+                "an empty or new folder for the products",
+            ));
+        }
         let made = !path.exists();
         fs::create_dir_all(path).map_err(|e| Error::io(path, e))?;
         let folder = ProductFolder { path: path.to_path_buf(), made };
@@ -83,6 +90,16 @@ mod tests {
         fs::write(folder.path().join("mine.txt"), "keep").expect("write");
         assert!(ProductFolder::claim(folder.path()).is_err());
         assert_eq!(fs::read_to_string(folder.path().join("mine.txt")).expect("kept"), "keep");
+    }
+
+    #[test]
+    fn a_file_is_no_folder() {
+        let folder = tempfile::tempdir().expect("temporary folder");
+        let path = folder.path().join("mine.txt");
+        fs::write(&path, "keep").expect("write");
+        let refused = ProductFolder::claim(&path).map(drop).expect_err("a file").to_string();
+        assert!(refused.contains("not a folder"), "{refused}");
+        assert_eq!(fs::read_to_string(path).expect("kept"), "keep");
     }
 
     #[test]

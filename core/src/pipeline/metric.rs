@@ -28,12 +28,12 @@ const MAX_PICTURES: usize = 12;
 
 /// The order of the stages, frame by frame.
 pub(super) fn measure(run: &mut Run<'_, '_, '_, '_>, source: Box<dyn Source>) -> Result<()> {
-    let Run { request, products, quality, progress, timings } = run;
+    let Run { request, beside, products, quality, progress, timings } = run;
     let (rig, recipe) = (&request.rig, &request.recipe);
     let shows_newest = products.shows_newest();
     let (colours_wanted, between) = (products.wants_colours(), products.wants_wall_colours());
     let mut pictures = products.wants_pictures().then(|| Pictures::new(recipe.recording.images_per_s));
-    let mut poses = Poses::new(request)?;
+    let mut poses = Poses::new(request, beside)?;
     let mut recent = RecentFrames::default();
     let mut waiting = WaitingFrames::default();
     let mut colours = ColourFinder::new(!between);

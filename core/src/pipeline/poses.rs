@@ -9,7 +9,7 @@ use crate::motion::metric::{Motion, Odometry, SettledPose};
 use crate::motion::track::{GivenPose, PoseTrack, TrackUse};
 use crate::motion::{Shift, start_pose};
 use crate::rig::Rig;
-use crate::source::Frame;
+use crate::source::{Beside, Frame};
 use crate::stripe::Stripe;
 use crate::triangulation::Profile;
 
@@ -30,15 +30,19 @@ enum Way {
 }
 
 impl<'a> Poses<'a> {
-    /// Reads the track, where there is one.
-    pub(super) fn new(request: &'a Request) -> Result<Poses<'a>> {
+    /// Reads the track, where there is one; else the odometry that the source brought is the prior.
+    pub(super) fn new(request: &'a Request, beside: &Beside) -> Result<Poses<'a>> {
         let (rig, recipe) = (&request.rig, &request.recipe);
         let read = |path| PoseTrack::read(path, rig.laser.line, recipe.limits.max_frames);
-        let way = match request.track_use() {
+        let way = match request.track_use(beside) {
             Some(TrackUse::Instead) => Way::Track(Given { start: start_pose(rig.laser.line), ..Given::default() }),
             Some(TrackUse::Prior) | None => Way::Image(Box::new(Odometry::new(rig, &recipe.pose))),
         };
-        let track = request.poses.as_deref().map(read).transpose()?;
+        let track = match request.poses.as_deref() {
+            Some(path) => Some(read(path)?),
+            None if beside.poses.is_empty() => None,
+            None => Some(PoseTrack::from_times(beside.poses.iter().map(|pose| (pose.time_s, pose.world_from_camera)))),
+        };
         Ok(Poses { rig, track, way, given_before: None, pose_before: None, frames: 0, frames_given: 0 })
     }
 

@@ -2,6 +2,8 @@
 
 use std::path::Path;
 
+use super::archiving::ArchivedJob;
+use super::laz::LazThread;
 use super::progress::Progress;
 use super::quality::QualityCounter;
 use super::{Cargo, Colours, Event, Newest, ProductGroup, Request, Timings};
@@ -13,7 +15,7 @@ use crate::export::archive_mcap::ArchiveWriter;
 use crate::export::cloud_ply::CloudPlyWriter;
 use crate::export::live_frame::{self, LiveFrameWriter};
 use crate::export::manifest::{
-    FileEntry, Gap, GrayScale, Manifest, Quality, SCHEMA_VERSION, list_products, sha256_of_bytes,
+    FileEntry, Gap, GrayScale, Manifest, Quality, SCHEMA_VERSION, Stretch, list_products, sha256_of_bytes,
 };
 use crate::export::npy::NpyWriter;
 use crate::export::preview::{self, Picture, PreviewText};
@@ -21,9 +23,9 @@ use crate::export::tiles::{TileGrid, TileWriter};
 use crate::export::trajectory_csv::{TrajectoryRow, TrajectoryWriter};
 use crate::export::{depth_png, depth_tif, texture};
 use crate::motion::track::TrackUse;
-use crate::recording::{FrameSteps, RecordedRun, Recorder, Segment};
+use crate::recording::{FrameSteps, RecordedRun, Recordings, Segment};
 use crate::rig::{LineDirection, Rig};
-use crate::source::{self, SourceInfo, encoded_frames};
+use crate::source::{self, Beside, SourceInfo};
 use crate::surface::{Placed, SurfacePoint};
 
 /// Where live recording segments lie in the product folder; they are no products.
@@ -32,14 +34,16 @@ const SEGMENTS: &str = "recording";
 /// All writers of a job.
 pub(super) struct Products<'a> {
     request: &'a Request,
+    beside: &'a Beside,
     map: Option<SurfaceMap>,
     /// What lays profiles on the map; with method `metric`.
     sheet: Option<Sheet>,
     tiles: Option<TileWriter>,
     trajectory: Option<TrajectoryWriter>,
     cloud: Option<CloudPlyWriter>,
+    laz: Option<LazThread>,
     stripes: Option<NpyWriter>,
-    recorder: Option<Recorder>,
+    recorder: Option<Recordings>,
     archive: Option<ArchiveWriter>,
     live: Option<LiveFrameWriter>,
     /// The robot still walks.
@@ -49,7 +53,7 @@ pub(super) struct Products<'a> {
 
 impl<'a> Products<'a> {
     /// Starts the files that grow with the frames.
-    pub(super) fn create(request: &'a Request, info: &SourceInfo) -> Result<Products<'a>> {
+    pub(super) fn create(request: &'a Request, info: &SourceInfo, beside: &'a Beside) -> Result<Products<'a>> {
         let (folder, rig, recipe) = (&request.out_dir, &request.rig, &request.recipe);
         let wanted = |group| request.products.contains(&group);
         let line_positions = match rig.laser.line {
@@ -65,12 +69,13 @@ impl<'a> Products<'a> {
         };
         let segments = request.live_segments.then(|| folder.join(SEGMENTS));
         let recorder =
-            || Recorder::create(&recipe.recording, rig, &run, &folder.join("recording.rrd"), segments.as_deref());
+            || Recordings::create(&recipe.recording, rig, &run, &folder.join("recording.rrd"), segments.as_deref());
         let archive = || {
             ArchiveWriter::create(&folder.join("archive.mcap"), rig, recipe, &request.source_name, request.recorded_at)
         };
         Ok(Products {
             request,
+            beside,
             map: None,
             sheet: None,
             tiles: None,
@@ -78,6 +83,7 @@ impl<'a> Products<'a> {
                 TrajectoryWriter::create(&folder.join("trajectory.csv"))
             })?,
             cloud: make(wanted(ProductGroup::Cloud), || CloudPlyWriter::create(&folder.join("cloud.ply")))?,
+            laz: make(wanted(ProductGroup::Cloud), || LazThread::start(&folder.join("cloud.laz")))?,
             stripes: make(recipe.stripe.keep, || {
                 NpyWriter::create(&folder.join("stripes.npy"), line_positions as usize)
             })?,
@@ -148,7 +154,7 @@ impl<'a> Products<'a> {
             }
             archive.profile(measured.time_s, &measured.profile, &points)?;
             archive.surface(measured.time_s, &points)?;
-            archive.measurement(measured.frame, measured.time_s, &cargo.stripe, &measured.shift)?;
+            archive.measurement(measured.frame, measured.time_s, &cargo.stripe, &measured.shift, &points)?;
         }
         let mut events = Vec::new();
         if let Some(recorder) = &mut self.recorder {
@@ -169,6 +175,9 @@ impl<'a> Products<'a> {
         let names: Vec<String> = [self.write_changed_tiles()?, self.write_live_frame(placed)?].concat();
         if self.request.live_segments && !names.is_empty() {
             events.push(Event::Files { names });
+        }
+        if let Some(laz) = &mut self.laz {
+            laz.push(points)?;
         }
         Ok(events)
     }
@@ -275,7 +284,8 @@ impl<'a> Products<'a> {
         let geometry = finished.as_ref().map(|map| map.geometry());
         let coverage = finished.as_ref().map_or(0.0, FinishedMap::coverage);
         let (quality, gaps, resolution) = quality.finish(&request.rig, coverage);
-        warn_of_quality(&quality, &gaps, request, progress)?;
+        let given = request.track_use(self.beside);
+        warn_of_quality(&quality, &gaps, request, given, progress)?;
         let (gray, picture) = timings.time("maps", || self.write_maps(finished.as_mut(), progress))?;
         if let Some(trajectory) = self.trajectory.take() {
             progress.step("trajectory")?;
@@ -284,6 +294,9 @@ impl<'a> Products<'a> {
         if let Some(cloud) = self.cloud.take() {
             progress.step("cloud")?;
             cloud.finish()?;
+        }
+        if let Some(laz) = self.laz.take() {
+            laz.finish()?;
         }
         if let Some(stripes) = self.stripes.take() {
             stripes.finish()?;
@@ -303,12 +316,13 @@ impl<'a> Products<'a> {
             resolution,
             quality,
             gaps,
+            recordings: Vec::new(),
             warnings: Vec::new(),
             timings_s: std::collections::BTreeMap::new(),
             products: Vec::new(),
         };
         let archived = timings.time("archive", || self.finish_archive(&manifest, finished.as_mut(), progress))?;
-        timings.time("recording", || self.finish_recording(picture, progress))?;
+        manifest.recordings = timings.time("recording", || self.finish_recording(picture, progress))?;
         if let Some(warning) = archived {
             progress.warn(warning)?;
         }
@@ -375,47 +389,20 @@ impl<'a> Products<'a> {
         PreviewText { title: self.request.source_name.clone(), ..PreviewText::default() }
     }
 
-    /// Completes the archive: the frames as they were given, the map, and what is attached. Returns what
-    /// could not be kept, in words.
     fn finish_archive(
         &mut self,
         manifest: &Manifest,
         map: Option<&mut FinishedMap<'_>>,
         progress: &mut Progress<'_, '_>,
     ) -> Result<Option<String>> {
-        let Some(mut archive) = self.archive.take() else { return Ok(None) };
-        let request = self.request;
+        let Some(archive) = self.archive.take() else { return Ok(None) };
         progress.step("archive")?;
-        let mut lost = None;
-        match encoded_frames(&request.source, &request.source_name, request.fps) {
-            Ok(frames) => {
-                for frame in frames.take(self.frames as usize) {
-                    archive.frame(&frame?)?;
-                }
-            }
-            Err(Error::Input { found, .. }) => lost = Some(format!("the archive holds no camera frames: {found}")),
-            Err(error) => return Err(error),
-        }
-        if let Some(map) = map {
-            let geometry = map.geometry();
-            archive.depth_map(&geometry, |column, row, width, height| map.window(column, row, width, height))?;
-        }
-        for warning in progress.warnings() {
-            archive.warning(warning)?;
-        }
-        let json = serde_json::to_vec_pretty(manifest).map_err(|e| Error::internal("archive", e))?;
-        archive.attach("manifest.json", "application/json", &json)?;
-        let preview = request.out_dir.join("preview.png");
-        if preview.exists() {
-            let picture = std::fs::read(&preview).map_err(|e| Error::io(&preview, e))?;
-            archive.attach("preview.png", "image/png", &picture)?;
-        }
-        archive.finish()?;
-        Ok(lost)
+        let job = ArchivedJob { request: self.request, beside: self.beside, frames: self.frames, manifest };
+        job.complete(archive, map, progress.warnings())
     }
 
-    fn finish_recording(&mut self, picture: Option<Picture>, progress: &mut Progress<'_, '_>) -> Result<()> {
-        let Some(mut recorder) = self.recorder.take() else { return Ok(()) };
+    fn finish_recording(&mut self, picture: Option<Picture>, progress: &mut Progress<'_, '_>) -> Result<Vec<Stretch>> {
+        let Some(mut recorder) = self.recorder.take() else { return Ok(Vec::new()) };
         progress.step("recording")?;
         if let Some(picture) = picture {
             recorder.log_map(picture.width_px() as u32, picture.height_px() as u32, picture.rgb())?;
@@ -423,8 +410,9 @@ impl<'a> Products<'a> {
         for warning in progress.warnings().to_vec() {
             recorder.log_warning(&warning)?;
         }
-        let segments = recorder.finish()?;
-        self.announcements(segments).into_iter().try_for_each(|event| progress.send(event))
+        let (segments, stretches) = recorder.finish()?;
+        self.announcements(segments).into_iter().try_for_each(|event| progress.send(event))?;
+        Ok(stretches)
     }
 }
 
@@ -490,7 +478,13 @@ fn hash_source(info: &SourceInfo, request: &Request) -> Result<Vec<FileEntry>> {
 }
 
 /// Says in words what the figures mean for a person.
-fn warn_of_quality(quality: &Quality, gaps: &[Gap], request: &Request, progress: &mut Progress<'_, '_>) -> Result<()> {
+fn warn_of_quality(
+    quality: &Quality,
+    gaps: &[Gap],
+    request: &Request,
+    given: Option<TrackUse>,
+    progress: &mut Progress<'_, '_>,
+) -> Result<()> {
     if quality.points == 0 && quality.spots > 0 {
         return progress.warn(
             "no point was measured: the laser line was found, but no ray to it meets the rig's laser plane in front of the \
@@ -515,7 +509,7 @@ fn warn_of_quality(quality: &Quality, gaps: &[Gap], request: &Request, progress:
     }
     let lost = quality.frames - 1 - quality.frames_tracked;
     // Of given poses that leave frames out, their reader has said so.
-    if lost > 0 && request.track_use() != Some(TrackUse::Instead) {
+    if lost > 0 && given != Some(TrackUse::Instead) {
         let places = gaps.iter().filter(|g| g.reason == "not_tracked").count();
         progress.warn(format!(
             "the motion was lost in {lost} of {} frames, in {places} places: lengths along the travel are too short there",

@@ -9,9 +9,10 @@ use ffmpeg::codec::Id;
 
 use super::folder::image_files;
 use super::frame_file::still_format;
+use super::mcap::{self, McapPackets};
 use super::segments::{Records, SegmentFolder, SegmentKind, StreamPart};
 use super::video::{display_name, open_container, open_pipe};
-use super::{DEFAULT_FOLDER_FPS, EncodedFormat, EncodedFrame, is_frame_file};
+use super::{DEFAULT_FOLDER_FPS, EncodedFormat, EncodedFrame, VideoFacts, is_frame_file};
 use crate::error::{Error, Result};
 
 /// The frames of a source as stored, in decoding order.
@@ -25,6 +26,7 @@ enum Kind {
     Folder { files: Vec<PathBuf>, next: usize, fps: f64 },
     Records { records: Records, first_time_ns: Option<i64> },
     Parts(StreamParts),
+    Mcap(Box<McapPackets>),
 }
 
 struct VideoPackets {
@@ -32,6 +34,12 @@ struct VideoPackets {
     stream: usize,
     time_base_s: f64,
     first_time_s: f64,
+    frames_per_s: f64,
+    facts: VideoFacts,
+    /// How much later a frame is shown than decoded, ticks: the first packet says.
+    delay: Option<i64>,
+    packets: u32,
+    last_order_s: f64,
     format: EncodedFormat,
     /// Set where packets carry length prefixes (MP4, MKV) instead of start codes.
     parameter_sets: Option<ParameterSets>,
@@ -41,7 +49,7 @@ struct VideoPackets {
 ///
 /// # Errors
 /// [`Error::Input`] where it cannot be opened, or is in a codec that archives have no schema for.
-pub fn encoded_frames(path: &Path, name: &str, fps: Option<f64>) -> Result<EncodedFrames> {
+pub fn encoded_frames(path: &Path, name: &str, fps: Option<f64>, topics: &[String]) -> Result<EncodedFrames> {
     let kind = if let Some(segments) = SegmentFolder::recognise(path, name)? {
         match segments.kind {
             SegmentKind::Frames => Kind::Records { records: Records::of_folder(segments), first_time_ns: None },
@@ -49,12 +57,26 @@ pub fn encoded_frames(path: &Path, name: &str, fps: Option<f64>) -> Result<Encod
         }
     } else if is_frame_file(path)? {
         Kind::Records { records: Records::of_file(path, name), first_time_ns: None }
+    } else if let Some(files) = mcap::files(path)? {
+        Kind::Mcap(Box::new(McapPackets::open(&files, name, topics)?))
     } else if path.is_dir() {
         Kind::Folder { files: image_files(path, name)?, next: 0, fps: fps.unwrap_or(DEFAULT_FOLDER_FPS) }
     } else {
         Kind::Video(Box::new(VideoPackets::of_input(open_container(path, name)?, name)?))
     };
     Ok(EncodedFrames { name: name.to_string(), kind })
+}
+
+impl EncodedFrames {
+    /// What the container says of its video beside the stream; `None` where it is none.
+    pub fn video(&self) -> Option<VideoFacts> {
+        match &self.kind {
+            Kind::Video(packets) => packets.format.is_video().then(|| packets.facts.clone()),
+            // A transport stream says all that there is to say in the stream itself.
+            Kind::Folder { .. } | Kind::Records { .. } | Kind::Parts(_) => None,
+            Kind::Mcap(packets) => packets.facts(),
+        }
+    }
 }
 
 impl Iterator for EncodedFrames {
@@ -65,6 +87,7 @@ impl Iterator for EncodedFrames {
             Kind::Video(packets) => packets.next().map(Ok),
             Kind::Records { records, first_time_ns } => next_stored(records, first_time_ns).transpose(),
             Kind::Parts(parts) => parts.next().transpose(),
+            Kind::Mcap(packets) => packets.next(),
             Kind::Folder { files, next, fps } => {
                 let file = files.get(*next)?;
                 let index = *next;
@@ -81,7 +104,7 @@ fn next_stored(records: &mut Records, first_time_ns: &mut Option<i64>) -> Result
         let Some(format) = still_format(&record.image) else { continue };
         let first_ns = *first_time_ns.get_or_insert(record.capture_time_ns);
         let time_s = (record.capture_time_ns.saturating_sub(first_ns) as f64 / 1e9).max(0.0);
-        return Ok(Some(EncodedFrame { time_s, format, key: true, data: record.image }));
+        return Ok(Some(EncodedFrame { time_s, order_s: time_s, format, key: true, data: record.image }));
     }
     Ok(None)
 }
@@ -105,7 +128,8 @@ impl StreamParts {
             if let Some((packets, _, start_s)) = &mut self.open
                 && let Some(frame) = packets.next()
             {
-                return Ok(Some(EncodedFrame { time_s: *start_s + frame.time_s, ..frame }));
+                let (time_s, order_s) = (*start_s + frame.time_s, *start_s + frame.order_s);
+                return Ok(Some(EncodedFrame { time_s, order_s, ..frame }));
             }
             if let Some((packets, part, _)) = self.open.take() {
                 drop(packets);
@@ -134,7 +158,7 @@ fn image_file(file: &Path, time_s: f64, name: &str) -> Result<EncodedFrame> {
         let subject = format!("{name}/{}", display_name(file));
         Error::input(subject, "an image format archives cannot hold", "JPEG, PNG or WebP")
     })?;
-    Ok(EncodedFrame { time_s, format, key: true, data })
+    Ok(EncodedFrame { time_s, order_s: time_s, format, key: true, data })
 }
 
 impl VideoPackets {
@@ -169,7 +193,27 @@ impl VideoPackets {
         let time_base_s = f64::from(base.0) / f64::from(base.1.max(1));
         let start = stream.start_time();
         let first_time_s = if start == i64::MIN { 0.0 } else { start as f64 * time_base_s };
-        Ok(VideoPackets { stream: stream.index(), time_base_s, first_time_s, format, parameter_sets, input })
+        let rate = stream.avg_frame_rate();
+        let known = rate.0 > 0 && rate.1 > 0;
+        let facts = VideoFacts {
+            colour_space: parameters.color_space().name().map(String::from),
+            colour_range: parameters.color_range().name().map(String::from),
+            chroma_location: parameters.chroma_location().name().map(String::from),
+            reordered: parameters.video_delay() > 0,
+        };
+        Ok(VideoPackets {
+            stream: stream.index(),
+            time_base_s,
+            first_time_s,
+            frames_per_s: if known { f64::from(rate.0) / f64::from(rate.1) } else { DEFAULT_FOLDER_FPS },
+            facts,
+            delay: None,
+            packets: 0,
+            last_order_s: 0.0,
+            format,
+            parameter_sets,
+            input,
+        })
     }
 
     fn next(&mut self) -> Option<EncodedFrame> {
@@ -182,18 +226,53 @@ impl VideoPackets {
                 Err(_) => return None,
             }
             let Some(data) = packet.data() else { continue };
-            let stamp = packet.pts().or(packet.dts()).unwrap_or(0);
-            return Some(EncodedFrame {
-                time_s: stamp as f64 * self.time_base_s - self.first_time_s,
-                format: self.format,
-                key: packet.is_key(),
-                data: match &self.parameter_sets {
-                    Some(sets) => sets.annex_b(data, packet.is_key()),
-                    None => data.to_vec(),
-                },
-            });
+            let data = match &self.parameter_sets {
+                Some(sets) => sets.annex_b(data, packet.is_key()),
+                None => data.to_vec(),
+            };
+            let (time_s, order_s) = self.times(packet.pts(), packet.dts());
+            return Some(EncodedFrame { time_s, order_s, format: self.format, key: packet.is_key(), data });
         }
     }
+
+    /// Capture time and decoding time of the next packet, s; counted where the file has no stamps.
+    fn times(&mut self, shown: Option<i64>, decoded: Option<i64>) -> (f64, f64) {
+        let since_first_s = |ticks: i64| ticks as f64 * self.time_base_s - self.first_time_s;
+        let counted_s = f64::from(self.packets) / self.frames_per_s;
+        self.packets += 1;
+        let time_s = shown.or(decoded).map_or(counted_s, since_first_s);
+        let order_s = match (self.facts.reordered, decoded) {
+            (false, _) => time_s,
+            (true, Some(decoded)) => {
+                let delay = *self.delay.get_or_insert(shown.map_or(0, |shown| shown - decoded));
+                since_first_s(decoded + delay)
+            }
+            (true, None) => counted_s,
+        };
+        self.last_order_s = order_s.max(self.last_order_s);
+        (time_s, self.last_order_s)
+    }
+}
+
+/// Whether decoding can start at a frame: always for single images; for video by its own bytes, and never where these
+/// do not say.
+pub fn is_key(format: EncodedFormat, data: &[u8]) -> bool {
+    match format {
+        EncodedFormat::H264 => nal_heads(data).any(|head| head & 0x1f == 5),
+        EncodedFormat::H265 => nal_heads(data).any(|head| (16..=21).contains(&(head >> 1 & 0x3f))),
+        // A frame marker, two bits of profile, "shows a frame seen before", then 0 for a key frame.
+        EncodedFormat::Vp9 => data.first().is_some_and(|b| b >> 6 == 0b10 && b & 0b0000_1100 == 0),
+        // A sequence header among the units, which encoders repeat at key frames.
+        EncodedFormat::Av1 => {
+            data.first().is_some_and(|b| b >> 3 & 0xf == 1) || data.get(2).is_some_and(|b| b >> 3 & 0xf == 1)
+        }
+        EncodedFormat::Jpeg | EncodedFormat::Png | EncodedFormat::Webp | EncodedFormat::Raw(_) => true,
+    }
+}
+
+/// The first byte of each unit of an Annex B frame.
+fn nal_heads(data: &[u8]) -> impl Iterator<Item = u8> + '_ {
+    data.windows(4).filter(|w| w[..3] == [0, 0, 1]).map(|w| w[3])
 }
 
 /// The codec's set-up bytes of a stream.

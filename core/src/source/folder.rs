@@ -97,7 +97,7 @@ impl Source for Folder {
 }
 
 /// Orders names so that numbers inside them count as numbers.
-fn natural_order(a: &str, b: &str) -> Ordering {
+pub(super) fn natural_order(a: &str, b: &str) -> Ordering {
     let (mut a, mut b) = (a.as_bytes(), b.as_bytes());
     loop {
         match (a.first(), b.first()) {

@@ -5,12 +5,14 @@ use std::path::{Path, PathBuf};
 use clap::Args;
 use serde_json::{Value, json};
 use stria_core::export::manifest::Manifest;
+use stria_core::mcap_file;
 use stria_core::rig::{LineDirection, Rig};
+use stria_core::source::use_of_topic;
 
 use super::progress::size;
 use super::{Failed, Outcome, Success};
 
-/// Show what a file is: a rig, a product folder (or its manifest.json), a video or a folder of images
+/// Show what a file is: a rig, a product folder (or its manifest.json), a video, a folder of images or an MCAP file
 #[derive(Args)]
 pub(super) struct Inspect {
     /// The file or folder
@@ -46,6 +48,9 @@ fn look(path: &Path) -> Result<(&'static str, Facts, Value), Failed> {
     }
     if path.is_dir() && path.join("manifest.json").exists() {
         return products(&path.join("manifest.json"));
+    }
+    if let Some(files) = stria_core::source::mcap_files(path)? {
+        return mcap(path, &files);
     }
     match extension.as_str() {
         "toml" => rig(path),
@@ -107,6 +112,59 @@ fn products(path: &Path) -> Result<(&'static str, Facts, Value), Failed> {
     facts.extend(manifest.warnings.iter().map(|w| ("warning", w.clone())));
     let value = serde_json::from_str(&text).unwrap_or(Value::Null);
     Ok(("a product folder", facts, value))
+}
+
+/// Topics that are listed for people, at most.
+const MAX_TOPICS: usize = 200;
+
+/// An MCAP file, or a bag's folder of them: its topics, and what each is good for here.
+fn mcap(path: &Path, files: &[PathBuf]) -> Result<(&'static str, Facts, Value), Failed> {
+    let contents = mcap_file::contents(files, &path.display().to_string())?;
+    let bytes: u64 = files.iter().filter_map(|f| std::fs::metadata(f).ok()).map(|f| f.len()).sum();
+    let start = jiff::Timestamp::from_nanosecond(i128::from(contents.start_ns));
+    let start = start.map_or_else(|_| "not known".into(), |time| time.to_string());
+    let length_s = (contents.end_ns - contents.start_ns) as f64 / 1e9;
+    let mut facts = vec![
+        ("size", format!("{} in {} {}", size(bytes), files.len(), if files.len() == 1 { "file" } else { "files" })),
+        ("begins", start.clone()),
+        ("length", format!("{length_s:.2} s")),
+    ];
+    let width = contents.topics.iter().map(|facts| facts.topic.name.len()).max().unwrap_or(0);
+    for topic in contents.topics.iter().take(MAX_TOPICS) {
+        let good_for = use_of_topic(&topic.topic).map_or_else(String::new, |word| format!("  [{word}]"));
+        let (name, schema) = (&topic.topic.name, &topic.topic.schema);
+        facts.push(("topic", format!("{name:width$}  {:>7} x {schema}{good_for}", topic.messages)));
+    }
+    if contents.topics.len() > MAX_TOPICS {
+        facts.push(("topics", format!("{} more", contents.topics.len() - MAX_TOPICS)));
+    }
+    if !contents.attachments.is_empty() {
+        facts.push(("attachments", contents.attachments.join(", ")));
+    }
+    facts.extend(contents.damage.iter().map(|damage| ("warning", damage.clone())));
+    let topics: Vec<Value> = contents
+        .topics
+        .iter()
+        .map(|facts| {
+            json!({
+                "name": facts.topic.name,
+                "schema": facts.topic.schema,
+                "encoding": facts.topic.encoding,
+                "messages": facts.messages,
+                "use": use_of_topic(&facts.topic),
+            })
+        })
+        .collect();
+    let value = json!({
+        "topics": topics,
+        "attachments": contents.attachments,
+        "begins": start,
+        "length_s": length_s,
+        "files": files.len(),
+        "bytes": bytes,
+        "damage": contents.damage,
+    });
+    Ok(("an MCAP file", facts, value))
 }
 
 /// A video or a folder of images.

@@ -1,5 +1,7 @@
 //! `stria process`: one run in, its products out. A person uses it, and every worker does.
 
+mod archived;
+
 use std::io::{Read, Write};
 use std::ops::ControlFlow;
 use std::path::{Path, PathBuf};
@@ -13,6 +15,7 @@ use stria_core::pipeline::{self, Event, ProductGroup, Request};
 use stria_core::recipe::{self, OptionInfo, Range, Recipe};
 use stria_core::rig::Rig;
 
+use self::archived::Archived;
 use super::progress::{JobBar, duration, size};
 use super::{Failed, Outcome, Success};
 use crate::wire::child::{End, Failure};
@@ -20,21 +23,25 @@ use crate::wire::child::{End, Failure};
 /// The exit code of a cancelled process.
 const CANCELLED: i32 = 130;
 
-/// Process a run: a video or a folder of images, with its rig, into a folder of products
+/// Process a run: a video, a folder of images or an MCAP file, with its rig, into a folder of products
 #[derive(Args)]
 #[command(after_long_help = options_help())]
 #[command(
-    after_help = "Example: stria process run.mp4 --rig rig.toml --out products\n`stria process --help` lists the options for --set."
+    after_help = "Examples: stria process run.mp4 --rig rig.toml --out products\n          stria process products/archive.mcap --out again\n`stria process --help` lists the options for --set."
 )]
 pub(super) struct Process {
-    /// A video file (whatever FFmpeg reads), or a folder of images, sorted by name
+    /// A video file (whatever FFmpeg reads), a folder of images, sorted by name, or an MCAP file
+    ///
+    /// Of MCAP it reads archives of stria, Foxglove's CompressedVideo, CompressedImage and RawImage, and bags of ROS 2 with
+    /// sensor_msgs Image or CompressedImage; their nav_msgs/Odometry helps to find the motion where /tf_static says how the
+    /// camera sits on the robot. An archive of stria brings its rig, recipe and poses along: it needs no other option.
     source: PathBuf,
-    /// The rig that it was recorded with: a TOML or JSON file
+    /// The rig that it was recorded with: a TOML or JSON file; an archive of stria brings its own
     #[arg(long, value_name = "FILE", env = "STRIA_RIG")]
-    rig: PathBuf,
-    /// How to process: a built-in recipe's name, or a TOML file
-    #[arg(long, value_name = "NAME|FILE", default_value = recipe::BUILT_IN[0], env = "STRIA_RECIPE")]
-    recipe: String,
+    rig: Option<PathBuf>,
+    /// How to process: a built-in recipe's name, or a TOML file [default: metric, or an archive's own]
+    #[arg(long, value_name = "NAME|FILE", env = "STRIA_RECIPE")]
+    recipe: Option<String>,
     /// Change one value of the recipe; may be given several times
     #[arg(long, value_name = "KEY=VALUE")]
     set: Vec<String>,
@@ -49,6 +56,9 @@ pub(super) struct Process {
     /// pose.track=prior the poses only say where to look for the image's motion, and carry the pose on where it is lost.
     #[arg(long, value_name = "FILE")]
     poses: Option<PathBuf>,
+    /// Read this topic of an MCAP file (images, odometry); may be given several times. `stria inspect` lists them
+    #[arg(long = "topic", value_name = "TOPIC")]
+    topics: Vec<String>,
     /// Make only these product groups, separated by commas
     #[arg(long, value_name = "A,B", value_delimiter = ',', value_parser = product_group)]
     only: Vec<ProductGroup>,
@@ -101,8 +111,8 @@ impl Process {
     }
 
     fn process(&self, stop: &AtomicBool) -> stria_core::Result<Manifest> {
-        let request = self.request()?;
-        let folder_was_there = self.out.exists();
+        let archived = Archived::of(&self.source)?;
+        let request = self.request(&archived)?;
         let bar = (!self.json).then(JobBar::new);
         let result = pipeline::process(&request, &mut |event| {
             self.show(bar.as_ref(), event);
@@ -111,15 +121,27 @@ impl Process {
         if let Some(bar) = &bar {
             bar.clear();
         }
-        if result.is_err() {
-            remove_halves(&self.out, folder_was_there);
-        }
         result
     }
 
-    fn request(&self) -> stria_core::Result<Request> {
-        let rig = Rig::load(&self.rig)?;
-        let mut recipe = Recipe::load(&self.recipe)?;
+    fn request(&self, archived: &Archived) -> stria_core::Result<Request> {
+        let rig = match (&self.rig, &archived.rig) {
+            (Some(path), _) => Rig::load(path)?,
+            (None, Some(rig)) => rig.clone(),
+            (None, None) => {
+                let source = self.source.display().to_string();
+                return Err(stria_core::Error::input(
+                    source,
+                    "no rig given with --rig",
+                    "the rig that it was recorded with",
+                ));
+            }
+        };
+        let mut recipe = match (&self.recipe, &archived.recipe) {
+            (Some(name), _) => Recipe::load(name)?,
+            (None, Some(recipe)) => recipe.clone(),
+            (None, None) => Recipe::load(recipe::BUILT_IN[0])?,
+        };
         for change in &self.set {
             let Some((key, value)) = change.split_once('=') else {
                 return Err(stria_core::Error::input(
@@ -130,17 +152,20 @@ impl Process {
             };
             recipe.set(key.trim(), value.trim())?;
         }
-        refuse_used_folder(&self.out)?;
         let name = self.source.file_name().map(|n| n.to_string_lossy().into_owned());
+        let name = self.name.clone().or(name).unwrap_or_else(|| self.source.display().to_string());
+        let captured_at = stria_core::source::captured_at_ns(&self.source, &name, &self.topics)?
+            .and_then(|ns| jiff::Timestamp::from_nanosecond(i128::from(ns)).ok());
         let only = if self.only.is_empty() { ProductGroup::ALL.to_vec() } else { self.only.clone() };
         Ok(Request {
             source: self.source.clone(),
-            source_name: self.name.clone().or(name).unwrap_or_else(|| self.source.display().to_string()),
+            topics: self.topics.clone(),
+            source_name: name,
             fps: self.fps,
-            recorded_at: self.recorded_at.unwrap_or_else(|| time_of(&self.source)),
+            recorded_at: self.recorded_at.or(captured_at).unwrap_or_else(|| time_of(&self.source)),
             rig,
             recipe,
-            poses: self.poses.clone(),
+            poses: self.poses.clone().or_else(|| archived.poses()),
             out_dir: self.out.clone(),
             products: only,
             live_segments: self.live_segments,
@@ -207,38 +232,6 @@ fn exit_with_stdin() -> Result<(), Failed> {
     };
     let thread = std::thread::Builder::new().name("stdin".into()).spawn(wait);
     thread.map(|_| ()).map_err(|e| Failed::Other(format!("stdin cannot be watched: {e}")))
-}
-
-/// Products never mix with other files, and never replace older ones.
-fn refuse_used_folder(out: &Path) -> stria_core::Result<()> {
-    let found = match std::fs::read_dir(out) {
-        Ok(mut entries) => match entries.next() {
-            None => return Ok(()),
-            Some(_) => "not empty",
-        },
-        Err(e) if e.kind() == std::io::ErrorKind::NotFound => return Ok(()),
-        Err(e) if e.kind() == std::io::ErrorKind::NotADirectory => "not a folder",
-        Err(e) => return Err(stria_core::Error::io(out, e)),
-    };
-    Err(stria_core::Error::input(format!("--out {}", out.display()), found, "a new or empty folder"))
-}
-
-/// After a failure nothing half-made stays. The folder was new or empty when we began.
-fn remove_halves(out: &Path, folder_was_there: bool) {
-    let removed = match folder_was_there {
-        false => std::fs::remove_dir_all(out),
-        true => std::fs::read_dir(out).and_then(|entries| {
-            entries.flatten().map(|e| e.path()).try_for_each(|path| match path.is_dir() {
-                true => std::fs::remove_dir_all(path),
-                false => std::fs::remove_file(path),
-            })
-        }),
-    };
-    if let Err(error) = removed
-        && error.kind() != std::io::ErrorKind::NotFound
-    {
-        eprintln!("stria: {}: what was half-made could not be removed: {error}", out.display());
-    }
 }
 
 fn summary(manifest: &Manifest, out: &Path, seconds: f64) {

@@ -104,23 +104,13 @@ pub(super) async fn get_product(
     send_product(&app, &job, &name, &method, &headers).await
 }
 
-/// The job's MCAP archive: the product `archive.mcap`.
-#[utoipa::path(get, path = "/api/jobs/{job}/archive.mcap", tag = "jobs",
-    params(("job" = String, Path, description = "The job")),
-    responses((status = 200, content_type = "application/octet-stream", body = Vec<u8>),
-        (status = 206, description = "A range of it"), (status = 304, description = "Not changed"),
-        (status = 404, body = Problem, content_type = "application/problem+json"),
-        (status = 416, body = Problem, content_type = "application/problem+json")))]
-pub(super) async fn get_archive(
-    State(app): State<App>,
-    Path(job): Path<String>,
-    method: Method,
-    headers: HeaderMap,
+pub(super) async fn send_product(
+    app: &App,
+    job: &str,
+    name: &str,
+    method: &Method,
+    headers: &HeaderMap,
 ) -> Result<Response> {
-    send_product(&app, &job, "archive.mcap", &method, &headers).await
-}
-
-async fn send_product(app: &App, job: &str, name: &str, method: &Method, headers: &HeaderMap) -> Result<Response> {
     let product = app.runs.product(job, name).await?;
     // Only pictures and texts are for looking at in the browser; the rest is for keeping.
     let content_type = content_type(name);

@@ -7,7 +7,7 @@ use axum::http::header::CONTENT_TYPE;
 use axum::response::{IntoResponse, Response};
 use serde::Deserialize;
 use stria_core::export::depth_tif::section::{self, Cut, Section};
-use stria_core::export::trajectory_csv;
+use stria_core::export::{section_csv, trajectory_csv};
 use utoipa::IntoParams;
 
 use super::App;
@@ -72,7 +72,7 @@ pub(super) async fn get_profile(
     let chainage_mm = |x_mm: f64| run.chainage_mm + sign * x_mm;
     if csv {
         let headers = [(CONTENT_TYPE, "text/csv; charset=utf-8")];
-        return Ok((headers, csv_of(&section, chainage_mm)).into_response());
+        return Ok((headers, section_csv::text(&section, chainage_mm)).into_response());
     }
     Ok(axum::Json(wire_of(job, &section, chainage_mm)).into_response())
 }
@@ -107,16 +107,6 @@ fn wire_of(job: String, section: &Section, chainage_mm: impl Fn(f64) -> f64) -> 
         y_mm: points.iter().map(|p| p.y_mm).collect(),
         z_mm: points.iter().map(|p| p.z_mm.is_finite().then_some(p.z_mm)).collect(),
     }
-}
-
-fn csv_of(section: &Section, chainage_mm: impl Fn(f64) -> f64) -> String {
-    let mut text = String::from("distance_mm,chainage_mm,x_mm,y_mm,z_mm\n");
-    for point in &section.points {
-        let z = if point.z_mm.is_finite() { point.z_mm.to_string() } else { String::new() };
-        let (distance, chainage) = (point.distance_mm, chainage_mm(point.x_mm));
-        text.push_str(&format!("{distance:.3},{chainage:.3},{:.3},{:.3},{z}\n", point.x_mm, point.y_mm));
-    }
-    text
 }
 
 #[derive(Deserialize, IntoParams)]

@@ -1,9 +1,9 @@
 //! The depth map as foxglove.Grid messages: pieces of bounded size, and one overview.
 
 use foxglove::messages::packed_element_field::NumericType;
-use foxglove::messages::{Grid, Timestamp, Vector2};
+use foxglove::messages::{Grid, RawImage, Timestamp, Vector2};
 
-use super::{fields, pose_at};
+use super::points::{fields, pose_at};
 use crate::depth_map::{MapGeometry, MapWindow};
 
 /// A message holds at most this many cells, 8 bytes each: what a reader must keep in memory at once.
@@ -117,6 +117,20 @@ pub(super) fn message(timestamp: Timestamp, frame_id: &str, geometry: &MapGeomet
             ("blue", 6, NumericType::Uint8),
             ("alpha", 7, NumericType::Uint8),
         ]),
+        data: data.into(),
+    }
+}
+
+/// A rectangle of the map as an image of float32, world z in metres, NaN where nothing was measured.
+pub(super) fn image(timestamp: Timestamp, frame_id: &str, content: &MapWindow) -> RawImage {
+    let data: Vec<u8> = content.depth_mm.iter().flat_map(|depth_mm| (depth_mm / 1000.0).to_le_bytes()).collect();
+    RawImage {
+        timestamp: Some(timestamp),
+        frame_id: frame_id.into(),
+        width: content.width_px as u32,
+        height: content.height_px as u32,
+        encoding: "32FC1".into(),
+        step: 4 * content.width_px as u32,
         data: data.into(),
     }
 }
