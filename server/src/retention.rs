@@ -28,8 +28,9 @@ pub async fn run(db: Db, store: Store, uploads: Uploads, bell: Bell, stop: Cance
     let mut changes = bell.listen();
     loop {
         let swept = async {
-            sweep(&db, &store).await?;
-            uploads.sweep().await
+            // First: it goes on with files that may be due here.
+            uploads.sweep().await?;
+            sweep(&db, &store).await
         };
         if let Err(error) = swept.await {
             tracing::warn!(%error, "cleaning up failed; it will be tried again");

@@ -19,6 +19,8 @@ pub struct Server {
     data: TempDir,
     flags: Vec<String>,
     variables: Vec<(String, String)>,
+    /// What starts the binary in its stead, with it as its last argument.
+    wrapper: Vec<String>,
     process: Option<Child>,
     url: String,
     client: Client,
@@ -38,11 +40,20 @@ impl Server {
     /// # Panics
     /// Where it does not become ready.
     pub fn start_with(flags: &[&str], variables: &[(String, String)]) -> Server {
+        Server::start_in(tempfile::tempdir().expect("a temporary folder"), flags, variables, &[])
+    }
+
+    /// Starts one in a folder, by a program that prepares its world and then becomes what its arguments say.
+    ///
+    /// # Panics
+    /// Where it does not become ready.
+    pub fn start_in(folder: TempDir, flags: &[&str], variables: &[(String, String)], wrapper: &[&str]) -> Server {
         let client = Client::builder().timeout(PATIENCE).build().expect("a client");
         let mut server = Server {
-            data: tempfile::tempdir().expect("a temporary folder"),
+            data: folder,
             flags: flags.iter().map(ToString::to_string).collect(),
             variables: variables.to_vec(),
+            wrapper: wrapper.iter().map(ToString::to_string).collect(),
             process: None,
             url: String::new(),
             client,
@@ -57,7 +68,9 @@ impl Server {
     /// Where it does not become ready.
     pub fn start_again(&mut self) {
         let listens = self.flags.iter().any(|flag| flag == "--listen");
-        let mut process = Command::new(stria())
+        let words: Vec<_> = self.wrapper.iter().map(Into::into).chain([stria().into_os_string()]).collect();
+        let mut process = Command::new(&words[0])
+            .args(&words[1..])
             .arg("serve")
             .args(if listens { &[][..] } else { &["--listen", "127.0.0.1:0"] })
             .arg("--data")

@@ -22,6 +22,8 @@ pub(super) enum Refusal {
     Version { found: String, expected: &'static str },
     /// The answer did not begin in time.
     TooSlow,
+    /// The connection went silent, or broke, in the middle of a piece of an upload; what arrived is kept.
+    CutOff,
 }
 
 /// What tus 1.0.0 answers to a wrong checksum.
@@ -125,6 +127,11 @@ impl IntoResponse for Refusal {
                 let mut problem = problem(status, "wrong-version", "The protocol's version does not fit", found, false);
                 problem.expected = Some(expected.into());
                 send(status, &problem)
+            }
+            Refusal::CutOff => {
+                // Not 408: clients of tus take every 4xx but 409 and 423 for the end.
+                let detail = "the sender went silent; ask how far the upload is, and go on there".into();
+                answer(StatusCode::SERVICE_UNAVAILABLE, "cut-off", "The piece did not arrive whole", detail, true)
             }
             Refusal::TooSlow => {
                 let detail = "the server did not answer in time".into();
