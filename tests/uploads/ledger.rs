@@ -4,31 +4,31 @@ use std::collections::BTreeMap;
 
 /// What was seen.
 #[derive(Default)]
-pub struct Ledger {
+pub(super) struct Ledger {
     uploads: BTreeMap<String, Account>,
 }
 
 /// What was seen of one upload, bytes.
 #[derive(Clone, Debug, Default)]
-pub struct Account {
+pub(super) struct Account {
     /// The farthest that an answer confirmed to the sender.
-    pub confirmed: u64,
+    pub(super) confirmed: u64,
     /// The farthest byte that went to the server.
-    pub reached: u64,
+    pub(super) reached: u64,
     /// Bytes that went to the server more than once …
-    pub sent_again: u64,
+    pub(super) sent_again: u64,
     /// … and the most of them after one cut.
-    pub worst: u64,
+    pub(super) worst: u64,
     /// Pieces that began.
-    pub pieces: u32,
+    pub(super) pieces: u32,
     /// What must not be, in words.
-    pub faults: Vec<String>,
+    pub(super) faults: Vec<String>,
     at: u64,
 }
 
 impl Ledger {
     /// A piece begins.
-    pub fn piece(&mut self, path: &str, offset: u64) {
+    pub(super) fn piece(&mut self, path: &str, offset: u64) {
         let account = self.uploads.entry(path.into()).or_default();
         account.pieces += 1;
         if offset < account.confirmed {
@@ -46,7 +46,7 @@ impl Ledger {
     }
 
     /// Bytes of the piece go to the server.
-    pub fn sent(&mut self, path: &str, bytes: u64) {
+    pub(super) fn sent(&mut self, path: &str, bytes: u64) {
         if let Some(account) = self.uploads.get_mut(path) {
             account.at += bytes;
             account.reached = account.reached.max(account.at);
@@ -54,31 +54,31 @@ impl Ledger {
     }
 
     /// An answer reached the sender.
-    pub fn confirmed(&mut self, path: &str, offset: u64) {
+    pub(super) fn confirmed(&mut self, path: &str, offset: u64) {
         if let Some(account) = self.uploads.get_mut(path) {
             account.confirmed = account.confirmed.max(offset);
         }
     }
 
     /// What cannot be accounted for.
-    pub fn fault(&mut self, path: &str, words: &str) {
+    pub(super) fn fault(&mut self, path: &str, words: &str) {
         self.uploads.entry(path.into()).or_default().faults.push(words.into());
     }
 
     /// What was seen of an upload.
-    pub fn of(&self, path: &str) -> Account {
+    pub(super) fn of(&self, path: &str) -> Account {
         self.uploads.get(path).cloned().unwrap_or_default()
     }
 
     /// The farthest that any upload came.
-    pub fn reached(&self) -> u64 {
+    pub(super) fn reached(&self) -> u64 {
         self.uploads.values().map(|account| account.reached).max().unwrap_or(0)
     }
 }
 
 /// The requests of one connection, as far as they came.
 #[derive(Default)]
-pub struct Requests {
+pub(super) struct Requests {
     head: Vec<u8>,
     body_left: u64,
     path: String,
@@ -86,12 +86,12 @@ pub struct Requests {
 
 impl Requests {
     /// The path of the latest request.
-    pub fn path(&self) -> &str {
+    pub(super) fn path(&self) -> &str {
         &self.path
     }
 
     /// Reads on: these bytes went to the server.
-    pub fn read(&mut self, mut bytes: &[u8], ledger: &mut Ledger) {
+    pub(super) fn read(&mut self, mut bytes: &[u8], ledger: &mut Ledger) {
         while !bytes.is_empty() {
             if self.body_left > 0 {
                 let now = self.body_left.min(bytes.len() as u64);
@@ -127,7 +127,7 @@ impl Requests {
 }
 
 /// A header that is a number, in the head of a message.
-pub fn field(head: &str, name: &str) -> Option<u64> {
+pub(super) fn field(head: &str, name: &str) -> Option<u64> {
     let lines = head.lines().filter_map(|line| line.split_once(':'));
     let mut values = lines.filter(|(found, _)| found.trim().eq_ignore_ascii_case(name)).map(|(_, value)| value);
     values.next_back()?.trim().parse().ok()

@@ -192,7 +192,18 @@ fn answers(base: &str) -> BTreeMap<&'static str, BTreeMap<&'static str, String>>
 }
 
 /// Where Stria means to differ: step (or `*`), what, Stria's answer, the reference's, and why.
-const DIFFERENCES: [(&str, &str, &str, &str, &str); 0] = [];
+const DIFFERENCES: [(&str, &str, &str, &str, &str); 10] = [
+    ("*", "cache-control", "no-store", "", "no cache on the way may keep what was wrong once"),
+    ("*", "tus-version", "1.0.0", "", "the protocol: a 412 says which versions there are"),
+    ("*", "upload-expires", "there", "", "who asks how far it is hears how long it will be kept"),
+    ("*", "upload-offset", "0", "", "a creation says where to begin"),
+    ("*", "upload-offset", "5", "", "a 409 says where to go on, which saves a question"),
+    ("create in another version", "status", "412", "400", "the protocol asks for 412"),
+    ("send at no offset", "status", "400", "403", "a header is missing; nothing is forbidden"),
+    ("send another type", "status", "415", "400", "the protocol asks for 415"),
+    ("create empty", "status", "400", "201", "a run without a video is refused before it is one"),
+    ("create empty", "location", "", "there", "the same"),
+];
 
 #[test]
 fn answers_are_those_of_the_reference_but_for_what_is_meant() {

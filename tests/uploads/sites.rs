@@ -7,7 +7,7 @@ use stria_tests::support::{eventually, files_below};
 use super::pieces::{
     Half, ask, assert_source, authority, content, create, number, offset, piece, runs, send_rest, source_sha256,
 };
-use super::storms::{BigFile, assert_arrived, tus_js_client};
+use super::storms::{BigFile, SYNC_BYTES, assert_arrived, tus_js_client};
 use super::tunnel::{Tunnel, Weather};
 
 /// Nothing of any upload is left in the bucket but what became a run.
@@ -28,7 +28,7 @@ fn an_upload_goes_on_at_whichever_server_the_next_connection_reaches() {
     let tunnel = Tunnel::to(&[&authority(&servers[0]), &authority(&servers[1])], weather, 51);
     let sent = tus_js_client(&tunnel.url("/api/uploads"), &file.path);
     assert_eq!(tunnel.cuts().len(), CUTS as usize, "the tunnel became calm too late");
-    assert_arrived(&servers[0], &tunnel, &sent, &file);
+    assert_arrived(&servers[0], &tunnel, &sent, &file, SYNC_BYTES);
     assert_eq!(source_sha256(&servers[1], &sent.run), file.sha256);
     let names = |server| (header(&ask(server, &sent.path), "stria-run"), header(&ask(server, &sent.path), "stria-job"));
     assert_eq!(names(&servers[0]), names(&servers[1]), "one run, one job, whoever is asked");

@@ -28,7 +28,7 @@ const ANSWER_LOST_ONE_IN: usize = 12;
 
 /// How connections end before their time.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, PartialOrd, Ord)]
-pub enum End {
+pub(super) enum End {
     /// Both sides are closed.
     Close,
     /// Both sides are reset: what lies in buffers is gone.
@@ -41,22 +41,22 @@ pub enum End {
 
 /// What the tunnel does to those who use it.
 #[derive(Clone, Copy)]
-pub struct Weather {
+pub(super) struct Weather {
     /// Cuts before it becomes calm.
-    pub cuts: u32,
+    pub(super) cuts: u32,
     /// Bytes between two cuts, on average.
-    pub bytes_between_cuts: usize,
+    pub(super) bytes_between_cuts: usize,
     /// Most bytes a second of one connection, MB/s; else as the dice say.
-    pub throttle_mb_s: Option<usize>,
+    pub(super) throttle_mb_s: Option<usize>,
 }
 
 impl Weather {
     /// It carries, and does nothing else.
-    pub const CALM: Weather = Weather { cuts: 0, bytes_between_cuts: 1, throttle_mb_s: None };
+    pub(super) const CALM: Weather = Weather { cuts: 0, bytes_between_cuts: 1, throttle_mb_s: None };
 }
 
 /// A tunnel with its own port.
-pub struct Tunnel {
+pub(super) struct Tunnel {
     address: SocketAddr,
     shared: Arc<Shared>,
     runtime: Option<Runtime>,
@@ -83,7 +83,7 @@ impl Tunnel {
     ///
     /// # Panics
     /// Where it cannot listen.
-    pub fn to(servers: &[&str], weather: Weather, seed: u64) -> Tunnel {
+    pub(super) fn to(servers: &[&str], weather: Weather, seed: u64) -> Tunnel {
         let runtime = tokio::runtime::Builder::new_multi_thread().worker_threads(2).enable_all().build();
         let runtime = runtime.expect("a runtime");
         let listener = runtime.block_on(TcpListener::bind("127.0.0.1:0")).expect("a free port");
@@ -105,32 +105,32 @@ impl Tunnel {
     }
 
     /// Leads elsewhere from now on.
-    pub fn lead_to(&self, servers: &[&str]) {
+    pub(super) fn lead_to(&self, servers: &[&str]) {
         self.shared.state().servers = parsed(servers);
     }
 
     /// Host and port of its near end.
-    pub fn authority(&self) -> String {
+    pub(super) fn authority(&self) -> String {
         self.address.to_string()
     }
 
     /// An address at its far end.
-    pub fn url(&self, path: &str) -> String {
+    pub(super) fn url(&self, path: &str) -> String {
         format!("http://{}{path}", self.address)
     }
 
     /// Ends all connections now.
-    pub fn cut(&self, end: End) {
+    pub(super) fn cut(&self, end: End) {
         self.shared.cut_now.send_replace(Some(end));
     }
 
     /// The cuts so far.
-    pub fn cuts(&self) -> Vec<End> {
+    pub(super) fn cuts(&self) -> Vec<End> {
         self.shared.state().cuts.clone()
     }
 
     /// Looks at what it saw.
-    pub fn look<T>(&self, at: impl FnOnce(&Ledger) -> T) -> T {
+    pub(super) fn look<T>(&self, at: impl FnOnce(&Ledger) -> T) -> T {
         at(&self.shared.state().ledger)
     }
 }
