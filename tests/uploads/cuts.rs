@@ -1,14 +1,14 @@
 //! What tusd tests of connections that end too soon, by its names: read time-out, network close, network reset, lock
 //! release, stop, concurrent PATCH; and kill -9.
 
-use std::path::Path;
 use std::time::{Duration, Instant};
 
 use stria_tests::support::eventually;
 use stria_tests::support::server::{Server, header, problem_of, send};
 
 use super::pieces::{
-    Half, assert_source, authority, content, create, number, offset, piece, runs, send_rest, server, wait_until_written,
+    Half, ask_records, assert_source, authority, content, create, number, offset, piece, runs, send_rest, server,
+    wait_until_written,
 };
 use super::storms::{BigFile, SYNC_BYTES, assert_arrived, tus_js_client};
 use super::tunnel::{End, Tunnel, Weather};
@@ -65,19 +65,8 @@ fn what_arrived_before_a_cut_is_kept_although_nobody_asks() {
     let (path, half) = half_sent(&server, &authority(&server), &content);
     drop(half);
     // A server that is killed keeps only what is in its records.
-    let database = server.data().join("stria.db");
-    let id = path.rsplit('/').next().unwrap_or_default().to_string();
-    eventually("the bytes are promised", || promised(&database, &id) == FIRST.to_string());
-}
-
-/// What the records say, read by a program that we did not write.
-fn promised(database: &Path, id: &str) -> String {
-    let python = Path::new(env!("CARGO_MANIFEST_DIR")).join("../target/python/bin/python");
-    let ask = "import sqlite3, sys; print(sqlite3.connect(sys.argv[1]).execute(\
-               'SELECT offset_bytes FROM uploads WHERE id = ?', sys.argv[2:]).fetchone()[0])";
-    let asked = std::process::Command::new(python).args(["-c", ask]).arg(database).arg(id).output();
-    let told = asked.expect("target/python: run `make setup`");
-    String::from_utf8_lossy(&told.stdout).trim().into()
+    let promised = || ask_records(&server, "SELECT offset_bytes FROM uploads WHERE id = ?", &path);
+    eventually("the bytes are promised", || promised() == FIRST.to_string());
 }
 
 #[test]

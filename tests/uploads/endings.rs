@@ -6,8 +6,8 @@ use stria_tests::support::server::{header, problem_of, send, text};
 use stria_tests::support::{eventually, files_below};
 
 use super::pieces::{
-    PIECE, ask, assert_source, content, create, creation, fields, growing_file, metadata, number, offset, piece, runs,
-    send_rest, server, sha256,
+    PIECE, ask, ask_records, assert_source, content, create, creation, fields, growing_file, metadata, number, offset,
+    piece, runs, send_rest, server, sha256,
 };
 
 /// A small upload, bytes.
@@ -66,6 +66,24 @@ fn a_creation_that_is_repeated_with_its_key_is_the_same_upload() {
     let again = send(begin().header("Content-Type", PIECE).body(content.clone()));
     assert_eq!((header(&again, "location"), number(&again, "upload-offset")), (path.clone(), 1000));
     assert_source(&server, &send_rest(&server, &path, &content), &content);
+}
+
+#[test]
+fn a_whole_upload_whose_server_died_becomes_a_run_although_nobody_asks() {
+    let mut server = server(&[]);
+    let content = content(BYTES, 36);
+    let path = create(&server, BYTES + 1);
+    send(piece(&server, &path, 0).body(content.clone()));
+    server.stop();
+    // As the records are after a death between the last byte and the run, more than a minute ago.
+    let died = "UPDATE uploads SET length_bytes = offset_bytes, expires_ms = expires_ms - 61000 WHERE id = ?";
+    ask_records(&server, died, &path);
+    server.start_again();
+    eventually("there is a run", || runs(&server) == 1);
+    let told = ask(&server, &path);
+    assert_eq!(number(&told, "upload-length"), BYTES);
+    assert_source(&server, &header(&told, "stria-run"), &content);
+    assert_eq!(runs(&server), 1);
 }
 
 #[test]

@@ -2,7 +2,7 @@
 
 use std::io::{Read, Write};
 use std::net::TcpStream;
-use std::path::PathBuf;
+use std::path::{Path, PathBuf};
 use std::time::Duration;
 
 use base64::Engine;
@@ -120,6 +120,24 @@ pub(super) fn runs(server: &Server) -> usize {
 pub(super) fn growing_file(server: &Server, path: &str) -> PathBuf {
     let id = path.rsplit('/').next().unwrap_or_default();
     server.data().join("store/uploads").join(id).join("whole")
+}
+
+/// Asks a server's SQLite about an upload (`?`), through a program that we did not write; the first cell of the answer.
+///
+/// # Panics
+/// Where it is missing or refuses.
+pub(super) fn ask_records(server: &Server, sql: &str, path: &str) -> String {
+    let python = Path::new(env!("CARGO_MANIFEST_DIR")).join("../target/python/bin/python");
+    let ask = "import sqlite3, sys\nwith sqlite3.connect(sys.argv[1], timeout=20) as records:\n\
+               \x20   row = records.execute(sys.argv[2], sys.argv[3:]).fetchone()\nprint(row[0] if row else '')";
+    let mut command = std::process::Command::new(python);
+    command
+        .args(["-c", ask])
+        .arg(server.data().join("stria.db"))
+        .args([sql, path.rsplit('/').next().unwrap_or_default()]);
+    let told = command.output().expect("target/python starts: run `make setup`");
+    assert!(told.status.success(), "{sql}: {}", String::from_utf8_lossy(&told.stderr));
+    String::from_utf8_lossy(&told.stdout).trim().into()
 }
 
 /// Waits until the server has written so many bytes of an upload, promised or not.
