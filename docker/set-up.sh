@@ -36,7 +36,7 @@ if [ -n "$missing" ]; then
 fi
 
 if [ "${1:-all}" = all ]; then
-  # Readers that we did not write, for the tests of the file formats; exact versions.
+  # Readers and clients that we did not write, for the tests of formats and protocols; exact versions.
   python=target/python
   if ! cmp -s tests/requirements.txt "$python/requirements.txt"; then
     rm -rf "$python"
@@ -45,8 +45,10 @@ if [ "${1:-all}" = all ]; then
     "$python/bin/pip" install --quiet --disable-pip-version-check -r tests/requirements.txt
     cp tests/requirements.txt "$python/requirements.txt"
   fi
-  if ! cmp -s tests/browser/package-lock.json tests/browser/node_modules/.installed; then
-    (cd tests/browser && npm ci --no-audit --no-fund)
-    cp tests/browser/package-lock.json tests/browser/node_modules/.installed
-  fi
+  for folder in tests/browser tests/uploads; do
+    if ! cmp -s "$folder/package-lock.json" "$folder/node_modules/.installed"; then
+      (cd "$folder" && npm ci --no-audit --no-fund)
+      cp "$folder/package-lock.json" "$folder/node_modules/.installed"
+    fi
+  done
 fi

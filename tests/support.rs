@@ -1,6 +1,7 @@
 //! What the tests of the service share: the real binary, simulated runs, a server of their own.
 
 pub mod cluster;
+pub mod dice;
 pub mod form;
 pub mod postgres;
 pub mod readers;

@@ -47,8 +47,9 @@ pub async fn run(
     let mut let_go: Option<std::time::Instant> = None;
     loop {
         let swept = async {
-            sweep(&db, &store).await?;
-            uploads.sweep().await
+            // First: it goes on with files that may be due here.
+            uploads.sweep().await?;
+            sweep(&db, &store).await
         };
         if let Err(error) = swept.await {
             tracing::warn!(%error, "cleaning up failed; it will be tried again");

@@ -151,7 +151,7 @@ impl Runs {
     pub async fn create(&self, new: NewRun, incoming: Incoming, key: Option<&str>) -> Result<Created<wire::Run>> {
         let Incoming { file, facts } = &incoming;
         let place = |source| async move {
-            self.store.take_file(file, &source, facts).await?;
+            self.store.take_known_file(file, &source, facts).await?;
             self.store.sync().await
         };
         self.place_and_record(&Queue::new_id(), new, facts, key, place).await

@@ -34,7 +34,7 @@ impl Turns {
     pub async fn take(self: &Arc<Turns>, id: &str, patience: Duration) -> Result<Turn> {
         let deadline = Instant::now() + patience;
         loop {
-            let mut ended = match self.try_take(id) {
+            let mut ended = match self.try_take(id, true) {
                 Ok(turn) => return Ok(turn),
                 Err(ended) => ended,
             };
@@ -45,10 +45,17 @@ impl Turns {
         }
     }
 
-    fn try_take(self: &Arc<Turns>, id: &str) -> std::result::Result<Turn, watch::Receiver<()>> {
+    /// Takes the turn where nobody has it, and disturbs nobody.
+    pub fn take_if_free(self: &Arc<Turns>, id: &str) -> Option<Turn> {
+        self.try_take(id, false).ok()
+    }
+
+    fn try_take(self: &Arc<Turns>, id: &str, disturb: bool) -> std::result::Result<Turn, watch::Receiver<()>> {
         let mut taken = self.0.lock().unwrap_or_else(PoisonError::into_inner);
         if let Some(other) = taken.get(id) {
-            other.wanted.cancel();
+            if disturb {
+                other.wanted.cancel();
+            }
             return Err(other.ended.clone());
         }
         let (running, ended) = watch::channel(());
@@ -80,6 +87,7 @@ mod tests {
         let turns = Arc::new(Turns::default());
         let first = turns.take("a", Duration::ZERO).await.expect("free");
         let other = turns.take("b", Duration::ZERO).await.expect("another upload");
+        assert!(turns.take_if_free("a").is_none() && turns.take_if_free("c").is_some());
         assert!(!first.wanted().is_cancelled());
         let refused = turns.take("a", Duration::from_millis(20)).await;
         assert!(matches!(refused, Err(Error::Locked(_))) && first.wanted().is_cancelled());

@@ -6,6 +6,7 @@ use std::time::{Duration, Instant};
 
 use serde_json::Value;
 use stria_tests::support::cluster::{Cluster, WorkerProcess};
+use stria_tests::support::dice::Dice;
 use stria_tests::support::server::{Server, is_alive, read, send, signal, text};
 use stria_tests::support::{eventually, files_below, form, short_run};
 
@@ -21,34 +22,6 @@ const PAUSED: Duration = Duration::from_millis(3500);
 const KILLS_OF_ONE_CHILD: u32 = 2;
 /// After this long without the last job done, something hangs.
 const PATIENCE: Duration = Duration::from_secs(900);
-
-/// Numbers that look random and can be repeated.
-struct Dice(u64);
-
-impl Dice {
-    fn new() -> Dice {
-        let told = std::env::var("STRIA_CHAOS_SEED").ok().and_then(|text| text.parse().ok());
-        let seed = told.unwrap_or_else(|| {
-            let now = std::time::SystemTime::now().duration_since(std::time::UNIX_EPOCH);
-            now.map_or(1, |t| t.as_nanos() as u64)
-        });
-        println!("STRIA_CHAOS_SEED={seed}");
-        Dice(seed | 1)
-    }
-
-    /// 0 to `below` - 1.
-    fn throw(&mut self, below: usize) -> usize {
-        // xorshift64*
-        self.0 ^= self.0 >> 12;
-        self.0 ^= self.0 << 25;
-        self.0 ^= self.0 >> 27;
-        (self.0.wrapping_mul(0x2545_f491_4f6c_dd1d) >> 33) as usize % below
-    }
-
-    fn wait(&mut self, most_ms: usize) {
-        std::thread::sleep(Duration::from_millis(self.throw(most_ms) as u64));
-    }
-}
 
 /// What the loop strikes.
 struct Site {
@@ -69,14 +42,14 @@ impl Site {
         let what = match dice.throw(8) {
             0 | 1 => {
                 self.server.kill();
-                dice.wait(300);
+                wait(dice, 300);
                 self.server.start_again();
                 "server killed"
             }
             2 | 3 => match worker {
                 Some(i) => {
                     self.workers[i].kill();
-                    dice.wait(300);
+                    wait(dice, 300);
                     self.workers[i].start_again();
                     "worker killed"
                 }
@@ -131,6 +104,10 @@ fn job_of(child: u32) -> Option<String> {
     Some(folder.rsplit('/').next()?.split('.').next()?.to_string())
 }
 
+fn wait(dice: &mut Dice, most_ms: usize) {
+    std::thread::sleep(Duration::from_millis(dice.throw(most_ms) as u64));
+}
+
 fn pause(process: u32) {
     signal("STOP", process);
     std::thread::sleep(PAUSED);
@@ -168,7 +145,7 @@ fn storm(site: &mut Site, dice: &mut Dice) -> Vec<String> {
                     })
                 })
                 .collect();
-            dice.wait(700);
+            wait(dice, 700);
             site.strike(dice);
             sent.into_iter().map(|thread| thread.join().expect("no refusal")).collect()
         });

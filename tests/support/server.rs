@@ -20,6 +20,8 @@ pub struct Server {
     data: TempDir,
     flags: Vec<String>,
     variables: Vec<(String, String)>,
+    /// What starts the binary in its stead, with it as its last argument.
+    wrapper: Vec<String>,
     process: Option<Child>,
     url: String,
     said: Arc<Mutex<Vec<String>>>,
@@ -59,20 +61,32 @@ impl Server {
     /// Where there is no place for it.
     pub fn stopped(flags: &[&str]) -> Server {
         let flags: Vec<&str> = flags.iter().copied().chain(["--without-authentication"]).collect();
-        Server::new(&flags, &[])
+        Server::new(tempfile::tempdir().expect("a temporary folder"), &flags, &[], &[])
     }
 
-    fn start_any(flags: &[&str], variables: &[(String, String)]) -> Server {
-        let mut server = Server::new(flags, variables);
+    /// Starts one in a folder, by a program that prepares its world and then becomes what its arguments say.
+    ///
+    /// # Panics
+    /// Where it does not become ready.
+    pub fn start_in(folder: TempDir, flags: &[&str], variables: &[(String, String)], wrapper: &[&str]) -> Server {
+        let flags: Vec<&str> = flags.iter().copied().chain(["--without-authentication"]).collect();
+        let mut server = Server::new(folder, &flags, variables, wrapper);
         server.start_again();
         server
     }
 
-    fn new(flags: &[&str], variables: &[(String, String)]) -> Server {
+    fn start_any(flags: &[&str], variables: &[(String, String)]) -> Server {
+        let mut server = Server::new(tempfile::tempdir().expect("a temporary folder"), flags, variables, &[]);
+        server.start_again();
+        server
+    }
+
+    fn new(folder: TempDir, flags: &[&str], variables: &[(String, String)], wrapper: &[&str]) -> Server {
         Server {
-            data: tempfile::tempdir().expect("a temporary folder"),
+            data: folder,
             flags: flags.iter().map(ToString::to_string).collect(),
             variables: variables.to_vec(),
+            wrapper: wrapper.iter().map(ToString::to_string).collect(),
             process: None,
             url: String::new(),
             said: Arc::default(),
@@ -92,7 +106,9 @@ impl Server {
     /// Where it does not become ready.
     pub fn start_again(&mut self) {
         let listens = self.flags.iter().any(|flag| flag == "--listen");
-        let mut process = Command::new(stria())
+        let words: Vec<_> = self.wrapper.iter().map(Into::into).chain([stria().into_os_string()]).collect();
+        let mut process = Command::new(&words[0])
+            .args(&words[1..])
             .arg("serve")
             .args(if listens { &[][..] } else { &["--listen", "127.0.0.1:0"] })
             .arg("--data")

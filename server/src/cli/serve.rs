@@ -50,6 +50,12 @@ pub(super) struct Serve {
     /// How long a robot whose connection broke may stay away before its live run is closed, s
     #[arg(long, value_name = "S", default_value_t = 60.0, env = "STRIA_LIVE_COME_BACK_S")]
     live_come_back_s: f64,
+    /// A sender may be silent in the middle of a request for so long, seconds; an upload then keeps what came
+    #[arg(long, value_name = "S", default_value_t = 60.0, env = "STRIA_SENDER_SILENCE_S")]
+    sender_silence_s: f64,
+    /// An upload that nobody goes on with is kept for so long, hours
+    #[arg(long, value_name = "H", default_value_t = 168.0, env = "STRIA_UPLOAD_KEPT_H")]
+    upload_kept_h: f64,
     #[command(flatten)]
     jobs: JobArgs,
     /// Delete runs that came in more than so many days ago, unless they are pinned; GET /api/retention says which
@@ -108,6 +114,8 @@ impl Serve {
         let quota_gb = self.quota_gb.map(|gb| positive("--quota-gb", gb, 1e9, "GB")).transpose()?;
         let upload_bytes = (positive("--max-upload-gb", self.max_upload_gb, 1e6, "GB")? * GB as f64) as u64;
         let come_back = Duration::from_secs_f64(positive("--live-come-back-s", self.live_come_back_s, 1e6, "s")?);
+        let sender_silence = positive("--sender-silence-s", self.sender_silence_s, 86_400.0, "s")?;
+        let kept_for = positive("--upload-kept-h", self.upload_kept_h, 1e5, "h")? * 3600.0;
         Ok(Config {
             listen: self.listen,
             places: self.places.places(&self.data)?,
@@ -120,12 +128,17 @@ impl Serve {
             },
             requests: RequestLimits {
                 upload_bytes,
+                sender_silence: Duration::from_secs_f64(sender_silence),
                 disk_reserve_bytes: self.jobs.disk_reserve_bytes()?,
                 per_s: doors.requests_per_s,
                 at_once: doors.requests_per_s.saturating_mul(10),
                 ..RequestLimits::default()
             },
-            uploads: UploadLimits { upload_bytes, ..UploadLimits::default() },
+            uploads: UploadLimits {
+                upload_bytes,
+                kept_for: Duration::from_secs_f64(kept_for),
+                ..UploadLimits::default()
+            },
             live: LiveLimits { come_back, ..LiveLimits::default() },
             jobs: self.jobs.limits()?,
         })
@@ -177,7 +190,7 @@ async fn serve(config: Config) -> std::result::Result<(), Failed> {
     let sweep = tokio::spawn(retention::run(
         db.clone(),
         store,
-        uploads,
+        uploads.clone(),
         runs,
         config.retention,
         queue.bell().clone(),
@@ -208,6 +221,9 @@ async fn serve(config: Config) -> std::result::Result<(), Failed> {
     };
     let end = async {
         let _ = answer.await;
+        // What arrived of an upload whose connection died is still being kept.
+        uploads.tasks().close();
+        let _ = tokio::time::timeout(config.requests.stop_grace, uploads.tasks().wait()).await;
         let _ = sweep.await;
         let _ = watch.await;
         let _ = step.await;

@@ -272,6 +272,7 @@ pub mod upload {
         pub hash_state: String,
         pub part_bytes: i64,
         pub parts_name: Option<String>,
+        pub tail_fence: i64,
         pub tail_number: i64,
         pub tail_bytes: i64,
     }

@@ -29,6 +29,8 @@ pub(super) enum Refusal {
     Scope { needed: Scope },
     /// Whoever asks came too often.
     TooMany { retry_after_s: u64 },
+    /// The connection went silent, or broke, in the middle of a piece of an upload; what arrived is kept.
+    CutOff,
 }
 
 /// What tus 1.0.0 answers to a wrong checksum.
@@ -162,6 +164,11 @@ impl IntoResponse for Refusal {
                 let mut response = answer(status, "too-many", "Too many requests", detail, true);
                 response.headers_mut().insert(RETRY_AFTER, HeaderValue::from(retry_after_s));
                 response
+            }
+            Refusal::CutOff => {
+                // Not 408: clients of tus take every 4xx but 409 and 423 for the end.
+                let detail = "the sender went silent; ask how far the upload is, and go on there".into();
+                answer(StatusCode::SERVICE_UNAVAILABLE, "cut-off", "The piece did not arrive whole", detail, true)
             }
             Refusal::TooSlow => {
                 let detail = "the server did not answer in time".into();

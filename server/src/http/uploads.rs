@@ -1,6 +1,10 @@
 //! `/api/uploads`: the tus 1.0.0 protocol (creation, creation-with-upload, creation-defer-length, checksum, expiration,
 //! termination). What an upload is, is `uploads.rs`'s; here are the headers and the status codes.
 
+mod checksum;
+
+use std::time::Duration;
+
 use axum::extract::{Request, State};
 use axum::http::header::{CACHE_CONTROL, CONTENT_LENGTH, LOCATION};
 use axum::http::request::Parts;
@@ -9,23 +13,28 @@ use axum::middleware::Next;
 use axum::response::{IntoResponse, Response};
 use base64::Engine;
 use base64::prelude::BASE64_STANDARD;
-use sha1::Sha1;
-use sha2::{Digest, Sha256};
+use tokio::time::Instant;
+use tokio_util::sync::CancellationToken;
+use tokio_util::task::TaskTracker;
 
+use self::checksum::{CHECKSUMS, Checksum};
 use super::App;
 use super::extract::Path;
 use super::form::{Body, Fields};
 use super::ingest::{content_type_of, idempotency_key};
 use super::problem::Refusal;
 use crate::error::{Error, Result};
-use crate::store::hex;
-use crate::uploads::{Held, NewUpload, Upload};
+use crate::uploads::{Held, NewUpload, Receiving, TAKEN_OVER, Upload};
 use crate::wire::Problem;
 
 const VERSION: &str = "1.0.0";
 const EXTENSIONS: &str = "creation,creation-with-upload,creation-defer-length,checksum,expiration,termination";
-const CHECKSUMS: &str = "sha1,sha256";
 const PIECE: &str = "application/offset+octet-stream";
+
+/// A request that shall end takes in what lies in its connection's buffers: until nothing comes for so long …
+const LAST_CHUNK: Duration = Duration::from_millis(20);
+/// … and no longer than this.
+const LAST_CHUNKS: Duration = Duration::from_millis(300);
 
 /// Longest metadata, bytes: a rig file travels in it.
 const METADATA_BYTES: usize = 64 * 1024;
@@ -96,7 +105,8 @@ fn abilities(app: &App) -> Response {
         (status = 460, body = Problem, content_type = "application/problem+json"),
         (status = 507, body = Problem, content_type = "application/problem+json")))]
 pub(super) async fn create_upload(State(app): State<App>, request: Request) -> Response {
-    apart(request, |parts, body| create(app, parts, body)).await
+    let task = app.uploads.tasks().clone();
+    apart(&task, request, |parts, body| create(app, parts, body)).await
 }
 
 /// How far an upload is. A request that is still writing to it is stopped first, so that the offset is final.
@@ -105,9 +115,14 @@ pub(super) async fn create_upload(State(app): State<App>, request: Request) -> R
         ("Tus-Resumable" = String, Header, description = "1.0.0")),
     responses((status = 200, description = "Upload-Offset, Upload-Length or Upload-Defer-Length, Upload-Metadata, \
             Upload-Expires; Stria-Run and Stria-Job once whole"),
-        (status = 404), (status = 410), (status = 423)))]
-pub(super) async fn get_upload(State(app): State<App>, Path(id): Path<String>) -> Result<Response> {
-    let mut held = app.uploads.take(&id).await?;
+        (status = 404), (status = 410), (status = 423), (status = 460)))]
+pub(super) async fn get_upload(State(app): State<App>, Path(id): Path<String>) -> Response {
+    let task = app.uploads.tasks().clone();
+    in_task(&task, async move { tell(&app, &id).await }).await.unwrap_or_else(Error::into_response)
+}
+
+async fn tell(app: &App, id: &str) -> Result<Response> {
+    let mut held = app.uploads.take(id).await?;
     held.finish_if_whole().await?;
     let upload = held.upload();
     let mut headers = progress_headers(&upload);
@@ -133,16 +148,17 @@ pub(super) async fn get_upload(State(app): State<App>, Path(id): Path<String>) -
     responses((status = 204, description = "Upload-Offset, Upload-Expires; Stria-Run, Stria-Job once whole"),
         (status = 400, body = Problem, content_type = "application/problem+json"),
         (status = 404, body = Problem, content_type = "application/problem+json"),
-        (status = 408, body = Problem, content_type = "application/problem+json"),
         (status = 409, body = Problem, content_type = "application/problem+json"),
         (status = 410, body = Problem, content_type = "application/problem+json"),
         (status = 413, body = Problem, content_type = "application/problem+json"),
         (status = 415, body = Problem, content_type = "application/problem+json"),
         (status = 423, body = Problem, content_type = "application/problem+json"),
         (status = 460, body = Problem, content_type = "application/problem+json"),
+        (status = 503, body = Problem, content_type = "application/problem+json"),
         (status = 507, body = Problem, content_type = "application/problem+json")))]
 pub(super) async fn send_piece(State(app): State<App>, Path(id): Path<String>, request: Request) -> Response {
-    apart(request, |parts, body| async move { patch(&app, &id, &parts, body).await }).await
+    let task = app.uploads.tasks().clone();
+    apart(&task, request, |parts, body| async move { patch(&app, &id, &parts, body).await }).await
 }
 
 /// A request of a client that can only POST: `X-HTTP-Method-Override` names the method that it means.
@@ -157,7 +173,7 @@ pub(super) async fn send_piece_by_post(
 ) -> Result<Response> {
     match text(request.headers(), "x-http-method-override") {
         Some("PATCH") => Ok(send_piece(State(app), Path(id), request).await),
-        Some("HEAD") => get_upload(State(app), Path(id)).await,
+        Some("HEAD") => Ok(get_upload(State(app), Path(id)).await),
         Some("DELETE") => delete_upload(State(app), Path(id)).await,
         _ => Ok(Refusal::Method { method: "POST".into(), path: request.uri().path().into() }.into_response()),
     }
@@ -169,29 +185,41 @@ pub(super) async fn send_piece_by_post(
         ("Tus-Resumable" = String, Header, description = "1.0.0")),
     responses((status = 204),
         (status = 404, body = Problem, content_type = "application/problem+json"),
-        (status = 410, body = Problem, content_type = "application/problem+json")))]
+        (status = 410, body = Problem, content_type = "application/problem+json"),
+        (status = 423, body = Problem, content_type = "application/problem+json")))]
 pub(super) async fn delete_upload(State(app): State<App>, Path(id): Path<String>) -> Result<Response> {
-    app.uploads.give_up(&id).await?;
+    let task = app.uploads.tasks().clone();
+    in_task(&task, async move { app.uploads.take(&id).await?.give_up().await }).await?;
     Ok(StatusCode::NO_CONTENT.into_response())
 }
 
-/// Works in a task of its own: when the connection dies, what arrived is still made durable.
-async fn apart<F>(request: Request, work: impl FnOnce(Parts, Body) -> F) -> Response
+/// Works in a task of its own: when the connection dies, what was begun is brought to its end.
+async fn in_task<T: Send + 'static>(
+    tasks: &TaskTracker,
+    work: impl Future<Output = Result<T>> + Send + 'static,
+) -> Result<T> {
+    let done = tasks.spawn(work).await;
+    done.unwrap_or_else(|e| Err(Error::Internal(format!("an upload's task stopped: {e}"))))
+}
+
+/// As [`in_task`], with a body: what arrived of it is still made durable.
+async fn apart<F>(tasks: &TaskTracker, request: Request, work: impl FnOnce(Parts, Body) -> F) -> Response
 where
     F: Future<Output = Result<Response>> + Send + 'static,
 {
     let waits_for_word = request.headers().contains_key(axum::http::header::EXPECT);
     let (parts, body) = request.into_parts();
     let body = Body::new(body);
-    let done = tokio::spawn(work(parts, body.clone())).await;
-    let result = done.unwrap_or_else(|e| Err(Error::Internal(format!("an upload's task stopped: {e}"))));
-    result.unwrap_or_else(|error| {
-        // Whoever is still sending would take a closed connection for a broken one and never read the answer.
-        if !waits_for_word {
-            tokio::spawn(body.drain());
-        }
-        error.into_response()
-    })
+    let response = match in_task(tasks, work(parts, body.clone())).await {
+        Ok(response) => response,
+        Err(Error::SenderSilent) => Refusal::CutOff.into_response(),
+        Err(error) => error.into_response(),
+    };
+    // Whoever is still sending would take a closed connection for a broken one and never read the answer.
+    if !waits_for_word {
+        tokio::spawn(body.drain());
+    }
+    response
 }
 
 async fn create(app: App, parts: Parts, body: Body) -> Result<Response> {
@@ -204,10 +232,17 @@ async fn create(app: App, parts: Parts, body: Body) -> Result<Response> {
             return Err(Error::field("Upload-Length", found, "a size in bytes, or Upload-Defer-Length: 1"));
         }
     };
-    let metadata = text(headers, "upload-metadata").unwrap_or_default();
+    let metadata = match headers.get("upload-metadata").map(HeaderValue::to_str) {
+        None => "",
+        Some(Ok(metadata)) => metadata,
+        Some(Err(_)) => {
+            let expected = "ASCII: each value is in base64";
+            return Err(Error::field("Upload-Metadata", "Upload-Metadata cannot be read", expected));
+        }
+    };
     let (run, sha256) = read_metadata(&app, metadata).await?.into_announced_run()?;
     let has_piece = content_type_of(headers) == PIECE;
-    let checksum = Checksum::announced(headers)?;
+    let checksum = Checksum::announced(text(headers, "upload-checksum"))?;
     let new = NewUpload { length_bytes, metadata: metadata.into(), run, sha256 };
     if let (Some(length), Some(piece)) = (length_bytes, content_length(headers))
         && piece > length
@@ -217,19 +252,23 @@ async fn create(app: App, parts: Parts, body: Body) -> Result<Response> {
     }
     app.disk.check(length_bytes.unwrap_or(0))?;
     let made = app.uploads.create(new, idempotency_key(headers)?.as_deref()).await?;
-    let location = format!("/api/uploads/{}", made.id);
-    let upload = if has_piece {
-        let mut held = app.uploads.take(&made.id).await?;
-        // A creation that is repeated brings its first piece again.
-        if held.upload().offset_bytes == 0 {
-            receive(&app, &mut held, body, checksum).await?;
-        }
-        held.finish_if_whole().await?;
-        held.upload()
-    } else {
-        made
-    };
-    Ok((StatusCode::CREATED, [(LOCATION, location)], headers_of(progress_headers(&upload))).into_response())
+    let location = [(LOCATION, format!("/api/uploads/{}", made.id))];
+    match if has_piece { first_piece(&app, &made.id, body, checksum).await } else { Ok(made) } {
+        Ok(upload) => Ok((StatusCode::CREATED, location, headers_of(progress_headers(&upload))).into_response()),
+        // The upload is there all the same, and can be gone on with.
+        Err(Error::SenderSilent) => Ok((location, Refusal::CutOff).into_response()),
+        Err(error) => Ok((location, error).into_response()),
+    }
+}
+
+async fn first_piece(app: &App, id: &str, body: Body, checksum: Option<Checksum>) -> Result<Upload> {
+    let mut held = app.uploads.take(id).await?;
+    // A creation that is repeated brings its first piece again.
+    if held.upload().offset_bytes == 0 {
+        receive(app, &mut held, body, checksum).await?;
+    }
+    held.finish_if_whole().await?;
+    Ok(held.upload())
 }
 
 async fn patch(app: &App, id: &str, parts: &Parts, body: Body) -> Result<Response> {
@@ -241,11 +280,9 @@ async fn patch(app: &App, id: &str, parts: &Parts, body: Body) -> Result<Respons
     let offset = text(headers, "upload-offset")
         .ok_or_else(|| Error::field("Upload-Offset", "Upload-Offset is missing", "the offset, bytes"))?;
     let offset = number("Upload-Offset", offset)?;
-    let checksum = Checksum::announced(headers)?;
+    let checksum = Checksum::announced(text(headers, "upload-checksum"))?;
+    let length = text(headers, "upload-length").map(|length| number("Upload-Length", length)).transpose()?;
     let mut held = app.uploads.take(id).await?;
-    if let Some(length) = text(headers, "upload-length") {
-        held.declare_length(number("Upload-Length", length)?).await?;
-    }
     let upload = held.upload();
     if offset != upload.offset_bytes {
         let mut answer = Error::Conflict(format!(
@@ -256,20 +293,32 @@ async fn patch(app: &App, id: &str, parts: &Parts, body: Body) -> Result<Respons
         answer.headers_mut().extend(headers_of([("upload-offset", upload.offset_bytes.to_string())]));
         return Ok(answer);
     }
-    if let (Some(length), Some(piece)) = (upload.length_bytes, content_length(headers))
+    if let Some(length) = length {
+        held.declare_length(length).await?;
+    }
+    if let (Some(length), Some(piece)) = (held.upload().length_bytes, content_length(headers))
         && offset.saturating_add(piece) > length
     {
         return Err(Error::TooLarge { limit_bytes: length });
     }
-    if upload.became.is_none() {
-        receive(app, &mut held, body, checksum).await?;
+    match held.upload().became {
+        None => receive(app, &mut held, body, checksum).await?,
+        // Its last answer was lost, and it is asked again with nothing more to send.
+        Some(_) => nothing_more(app, body, offset).await?,
     }
     held.finish_if_whole().await?;
     Ok((StatusCode::NO_CONTENT, headers_of(progress_headers(&held.upload()))).into_response())
 }
 
+async fn nothing_more(app: &App, mut body: Body, length_bytes: u64) -> Result<()> {
+    match body.chunk(app.config.requests.sender_silence).await? {
+        Some(chunk) if !chunk.is_empty() => Err(Error::TooLarge { limit_bytes: length_bytes }),
+        _ => Ok(()),
+    }
+}
+
 /// Takes a piece in, as far as it comes.
-async fn receive(app: &App, held: &mut Held, mut body: Body, mut checksum: Option<Checksum>) -> Result<()> {
+async fn receive(app: &App, held: &mut Held, body: Body, mut checksum: Option<Checksum>) -> Result<()> {
     app.disk.check(0)?;
     let Ok(_permit) = app.arrivals.clone().try_acquire_owned() else {
         let most = app.config.requests.uploads_at_once;
@@ -277,73 +326,78 @@ async fn receive(app: &App, held: &mut Held, mut body: Body, mut checksum: Optio
     };
     let wanted = held.wanted_by_another().clone();
     let mut receiving = held.receive(checksum.is_some()).await?;
-    let ended = loop {
-        let chunk = tokio::select! {
-            biased;
-            () = wanted.cancelled() => break Err(Error::Locked("another request has taken the upload over".into())),
-            () = app.stop.cancelled() => break Err(Error::Busy("the server stops; come back in a moment".into())),
-            chunk = body.chunk(app.config.requests.sender_silence) => chunk,
-        };
-        match chunk {
-            Ok(Some(chunk)) => {
-                if let Some(checksum) = &mut checksum {
-                    checksum.update(&chunk);
-                }
-                // After a failed write nothing is sure but what was promised before.
-                receiving.push(&chunk).await?;
-            }
-            Ok(None) => break Ok(()),
-            Err(error) => break Err(error),
-        }
+    let arrived = take_in(app, &wanted, body, &mut receiving, &mut checksum).await;
+    let (kept, ended) = match (arrived, checksum) {
+        // After a failed write nothing is sure but what was promised before.
+        (Err(error), _) => (Err(error), Ok(())),
+        // A piece with a checksum counts as a whole.
+        (Ok(Err(ended)), Some(_)) => (Err(ended), Ok(())),
+        (Ok(ended), None) => (receiving.commit().await, ended),
+        (Ok(Ok(())), Some(checksum)) => match checksum.check() {
+            Ok(()) => (receiving.commit().await, Ok(())),
+            Err(wrong) => (Err(wrong), Ok(())),
+        },
     };
-    match checksum {
-        Some(_) if ended.is_err() => return ended,
-        Some(checksum) => checksum.check()?,
-        None => {}
+    if let Err(error) = kept {
+        receiving.drop_the_rest().await;
+        return Err(error);
     }
-    receiving.finish().await?;
     ended
 }
 
-/// The checksum that a piece shall have.
-enum Checksum {
-    Sha1(Sha1, Vec<u8>),
-    Sha256(Sha256, Vec<u8>),
+/// Takes in what comes; says how that ended. The outer error is one of ours.
+async fn take_in(
+    app: &App,
+    wanted: &CancellationToken,
+    mut body: Body,
+    receiving: &mut Receiving<'_>,
+    checksum: &mut Option<Checksum>,
+) -> Result<Result<()>> {
+    let mut asked_to_end = None;
+    loop {
+        let patience = match &asked_to_end {
+            None => app.config.requests.sender_silence,
+            Some((reason, deadline)) if Instant::now() >= *deadline => return Ok(Err(Error::from(reason))),
+            Some(_) => LAST_CHUNK,
+        };
+        let chunk = tokio::select! {
+            biased;
+            () = wanted.cancelled(), if asked_to_end.is_none() => {
+                asked_to_end = Some((Asked::TakenOver, Instant::now() + LAST_CHUNKS));
+                continue;
+            }
+            () = app.stop.cancelled(), if asked_to_end.is_none() => {
+                asked_to_end = Some((Asked::Stop, Instant::now() + LAST_CHUNKS));
+                continue;
+            }
+            chunk = body.chunk(patience) => chunk,
+        };
+        match (chunk, &asked_to_end) {
+            (Ok(Some(chunk)), _) => {
+                if let Some(checksum) = checksum {
+                    checksum.update(&chunk);
+                }
+                receiving.push(&chunk).await?;
+            }
+            (Ok(None), _) => return Ok(Ok(())),
+            (Err(_), Some((reason, _))) => return Ok(Err(Error::from(reason))),
+            (Err(error), None) => return Ok(Err(error)),
+        }
+    }
 }
 
-impl Checksum {
-    fn announced(headers: &HeaderMap) -> Result<Option<Checksum>> {
-        let Some(header) = text(headers, "upload-checksum") else { return Ok(None) };
-        let wrong = || {
-            let found = format!("Upload-Checksum is {header:?}");
-            Error::field("Upload-Checksum", found, format!("one of {CHECKSUMS}, a space, and the checksum in base64"))
-        };
-        let (algorithm, encoded) = header.split_once(' ').ok_or_else(wrong)?;
-        let expected = BASE64_STANDARD.decode(encoded.trim()).map_err(|_| wrong())?;
-        match algorithm {
-            "sha1" => Ok(Some(Checksum::Sha1(Sha1::new(), expected))),
-            "sha256" => Ok(Some(Checksum::Sha256(Sha256::new(), expected))),
-            _ => Err(wrong()),
-        }
-    }
+/// Why a request that still receives shall end.
+enum Asked {
+    TakenOver,
+    Stop,
+}
 
-    fn update(&mut self, chunk: &[u8]) {
-        match self {
-            Checksum::Sha1(hash, _) => hash.update(chunk),
-            Checksum::Sha256(hash, _) => hash.update(chunk),
+impl From<&Asked> for Error {
+    fn from(asked: &Asked) -> Error {
+        match asked {
+            Asked::TakenOver => Error::Locked(TAKEN_OVER.into()),
+            Asked::Stop => Error::Busy("the server stops; come back in a moment".into()),
         }
-    }
-
-    fn check(self) -> Result<()> {
-        let (found, expected) = match self {
-            Checksum::Sha1(hash, expected) => (hash.finalize().to_vec(), expected),
-            Checksum::Sha256(hash, expected) => (hash.finalize().to_vec(), expected),
-        };
-        if found == expected {
-            return Ok(());
-        }
-        let (found, expected) = (hex(&found), hex(&expected));
-        Err(Error::Checksum(format!("the piece arrived with the checksum {found}; expected {expected}; send it again")))
     }
 }
 
@@ -403,5 +457,6 @@ fn content_length(headers: &HeaderMap) -> Option<u64> {
 }
 
 fn number(name: &str, value: &str) -> Result<u64> {
-    value.trim().parse().map_err(|_| Error::field(name, format!("{name} is {value:?}"), "a whole number of bytes"))
+    let digits = value.bytes().all(|b| b.is_ascii_digit()).then(|| value.parse().ok()).flatten();
+    digits.ok_or_else(|| Error::field(name, format!("{name} is {value:?}"), "a whole number of bytes"))
 }

@@ -1,7 +1,8 @@
 -- Uploads that are not a run yet (tus). `offset_bytes` is what is promised: everything before it is durable. `hash_state`
 -- is the SHA-256 of those bytes as far as it got, so that no byte is read again, by whichever server goes on. `fence`
 -- grows with every request that takes the upload over, and goes into its writes. A file on S3 is a multipart upload
--- (`parts_name`) whose parts are rows; what does not fill a part yet is an object, `tail_number`.
+-- (`parts_name`) whose parts are rows; what does not fill a part yet is an object, the `tail_number`-th of the request
+-- with `tail_fence`.
 CREATE TABLE uploads (
     id TEXT NOT NULL PRIMARY KEY,
     created_ms BIGINT NOT NULL,
@@ -20,6 +21,7 @@ CREATE TABLE uploads (
     hash_state TEXT NOT NULL,
     part_bytes BIGINT NOT NULL,
     parts_name TEXT,
+    tail_fence BIGINT NOT NULL,
     tail_number BIGINT NOT NULL,
     tail_bytes BIGINT NOT NULL
 );

@@ -30,9 +30,10 @@ impl Key {
         Key::new(format!("{}segments/{number:06}-{fence}{}", run_prefix(run), dotted(extension)))
     }
 
-    /// A part of an upload that is not a run yet, from 0.
-    pub fn upload_part(upload: &str, number: u32) -> Key {
-        Key::new(format!("{}{number:06}", upload_prefix(upload)))
+    /// What does not fill a part yet of an upload on S3. The fence keeps a request that was taken over from writing
+    /// into its successor's.
+    pub fn upload_tail(upload: &str, fence: i64, number: i64) -> Key {
+        Key::new(format!("{}{fence}-{number}", upload_prefix(upload)))
     }
 
     /// An upload that is not a run yet, in one file.
@@ -144,6 +145,6 @@ mod tests {
     fn keys_sort_by_their_numbers() {
         assert_eq!(Key::source_segment("r", 7, 2, "mp4").as_str(), "runs/r/segments/000007-2.mp4");
         assert_eq!(Key::source_segment("r", 7, 2, "mp4").filename(), "000007-2.mp4");
-        assert!(Key::upload_part("u", 9) < Key::upload_part("u", 10));
+        assert_eq!(Key::upload_tail("u", 3, 9).as_str(), "uploads/u/3-9");
     }
 }

@@ -18,11 +18,21 @@ const MOST_PARTS: u64 = 9_000;
 const PARTS_AT_ONCE: usize = 4;
 
 impl Store {
-    /// Takes a file in that is as `facts` say: in a folder by renaming it where it lies on the same disk. Durable
-    /// after [`Store::sync`].
+    /// Takes a file in that shall be as `facts` say, and looks whether it is: in a folder by renaming it where it lies
+    /// on the same disk. Durable after [`Store::sync`].
     pub async fn take_file(&self, from: &Path, key: &Key, facts: &Facts) -> Result<()> {
-        if let Place::Folder { files, .. } = &self.place {
+        if self.folder().is_some() {
             check_file(from, facts).await?;
+        }
+        self.take_known_file(from, key, facts).await
+    }
+
+    /// As [`Store::take_file`], for a file that this process hashed while it came in: in a folder only its size is
+    /// looked at, since to read 64 GB again would take minutes.
+    pub async fn take_known_file(&self, from: &Path, key: &Key, facts: &Facts) -> Result<()> {
+        if let Place::Folder { files, .. } = &self.place {
+            let bytes = tokio::fs::metadata(from).await.map_err(|e| Error::io(from, e))?.len();
+            check(from, &Facts { bytes, sha256: facts.sha256.clone() }, Some(facts))?;
             let to = files.path_to_filesystem(&self.path(key))?;
             let source = from.to_path_buf();
             match blocking(move || rename_into(&source, &to)).await? {

@@ -2,7 +2,7 @@
 //! kept as an object of its own. Only what [`BytesSoFar::make_durable`] answered may be promised.
 
 use std::io::SeekFrom;
-use std::path::PathBuf;
+use std::path::{Path, PathBuf};
 
 use bytes::Bytes;
 use sha2_resumable::Sha256;
@@ -10,11 +10,11 @@ use sha2_resumable::digest::Digest;
 use tokio::fs::File;
 use tokio::io::{AsyncSeekExt, AsyncWriteExt};
 
-use super::{prefix_of, to_i64, to_u64};
+use super::{gone, to_i64, to_u64};
 use crate::db::tables::upload;
 use crate::error::{Error, Result};
 use crate::resumed_hash;
-use crate::store::{Facts, Key, Store};
+use crate::store::{Facts, Key, Store, upload_prefix};
 
 /// An upload's bytes, open for more.
 pub(super) struct BytesSoFar {
@@ -24,7 +24,7 @@ pub(super) struct BytesSoFar {
 }
 
 enum Place {
-    Folder { path: PathBuf, file: File },
+    Folder { path: PathBuf, file: File, promised_bytes: u64 },
     Bucket(Box<Parts>),
 }
 
@@ -38,28 +38,50 @@ struct Parts {
     tail: Vec<u8>,
     next_part: i64,
     new_parts: Vec<(i64, String)>,
-    tail_number: i64,
-    tail_kept_bytes: i64,
-    /// The tail that the row promises.
-    old_tail: Option<i64>,
+    /// This request's, which goes into the names of its tails.
+    fence: i64,
+    /// The tail that is kept now …
+    kept: Tail,
+    /// … and the one that the row promises.
+    promised: Tail,
+}
+
+/// Bytes after the last whole part, kept as an object; no bytes, no object.
+#[derive(Clone, Copy, PartialEq, Eq)]
+pub(super) struct Tail {
+    pub(super) fence: i64,
+    pub(super) number: i64,
+    pub(super) bytes: i64,
+}
+
+impl Tail {
+    fn of(row: &upload::Model) -> Tail {
+        Tail { fence: row.tail_fence, number: row.tail_number, bytes: row.tail_bytes }
+    }
+
+    fn key(self, upload: &str) -> Key {
+        Key::upload_tail(upload, self.fence, self.number)
+    }
 }
 
 /// What is durable now.
 pub(super) struct Progress {
     pub(super) offset_bytes: i64,
     pub(super) hash_state: String,
-    pub(super) tail_number: i64,
-    pub(super) tail_bytes: i64,
+    pub(super) tail: Tail,
     pub(super) new_parts: Vec<(i64, String)>,
 }
 
 impl BytesSoFar {
     /// Opens them as the row promises them: what came after that and was not promised is dropped.
-    pub(super) async fn open(store: &Store, row: &mut upload::Model, parts: Vec<String>) -> Result<BytesSoFar> {
+    pub(super) async fn open(store: &Store, row: &upload::Model, parts: Vec<String>) -> Result<BytesSoFar> {
         let offset_bytes = to_u64(row.offset_bytes);
         let hash = resumed_hash::read(&row.hash_state)?;
         let place = match file_of(store, row) {
-            Some(path) => Place::Folder { file: open_file(&path, offset_bytes).await?, path },
+            Some(path) => {
+                let file = open_file(store, &path, offset_bytes).await?;
+                Place::Folder { path, file, promised_bytes: offset_bytes }
+            }
             None => Place::Bucket(Box::new(Parts::open(store, row, parts).await?)),
         };
         Ok(BytesSoFar { offset_bytes, hash, place })
@@ -72,7 +94,7 @@ impl BytesSoFar {
 
     pub(super) async fn push(&mut self, chunk: &[u8]) -> Result<()> {
         match &mut self.place {
-            Place::Folder { path, file } => file.write_all(chunk).await.map_err(|e| Error::io(path, e))?,
+            Place::Folder { path, file, .. } => file.write_all(chunk).await.map_err(|e| Error::io(path, e))?,
             Place::Bucket(parts) => parts.push(chunk).await?,
         }
         self.hash.update(chunk);
@@ -82,59 +104,58 @@ impl BytesSoFar {
 
     /// Makes all of it durable.
     pub(super) async fn make_durable(&mut self) -> Result<Progress> {
-        let state = resumed_hash::write(&self.hash);
+        let mut progress = Progress {
+            offset_bytes: to_i64(self.offset_bytes),
+            hash_state: resumed_hash::write(&self.hash),
+            tail: Tail { fence: 0, number: 0, bytes: 0 },
+            new_parts: Vec::new(),
+        };
         match &mut self.place {
-            Place::Folder { path, file } => {
+            Place::Folder { path, file, .. } => {
                 let failed = |e| Error::io(path.as_path(), e);
                 file.flush().await.map_err(failed)?;
                 file.sync_data().await.map_err(failed)?;
-                Ok(Progress {
-                    offset_bytes: to_i64(self.offset_bytes),
-                    hash_state: state,
-                    tail_number: 0,
-                    tail_bytes: 0,
-                    new_parts: Vec::new(),
-                })
             }
             Place::Bucket(parts) => {
                 parts.keep_tail().await?;
-                Ok(Progress {
-                    offset_bytes: to_i64(self.offset_bytes),
-                    hash_state: state,
-                    tail_number: parts.tail_number,
-                    tail_bytes: parts.tail_kept_bytes,
-                    new_parts: std::mem::take(&mut parts.new_parts),
-                })
+                (progress.tail, progress.new_parts) = (parts.kept, parts.new_parts.clone());
+            }
+        }
+        Ok(progress)
+    }
+
+    /// What was made durable is promised now: what it replaces goes.
+    pub(super) async fn promised(&mut self) {
+        match &mut self.place {
+            Place::Folder { promised_bytes, .. } => *promised_bytes = self.offset_bytes,
+            Place::Bucket(parts) => {
+                parts.new_parts.clear();
+                let old = std::mem::replace(&mut parts.promised, parts.kept);
+                if old.bytes == 0 || old == parts.kept {
+                    return;
+                }
+                if let Err(error) = parts.store.delete(&old.key(&parts.upload)).await {
+                    // It goes with the upload.
+                    tracing::debug!(%error, "an old tail stays for now");
+                }
             }
         }
     }
-}
 
-impl BytesSoFar {
-    /// The new tail is promised: the one before goes.
-    pub(super) async fn forget_old_tail(&mut self) {
-        let Place::Bucket(parts) = &mut self.place else { return };
-        let Some(old) = parts.old_tail.replace(parts.tail_number).filter(|old| *old != parts.tail_number) else {
-            return;
-        };
-        let gone = match number(old) {
-            Ok(old) => parts.store.delete(&Key::upload_part(&parts.upload, old)).await,
-            Err(error) => Err(error),
-        };
-        if let Err(error) = gone {
-            // It goes with the upload.
-            tracing::debug!(%error, "an old tail stays for now");
+    /// Gives the room back of what is not promised: the disk may be full, and the records may be on it.
+    pub(super) async fn drop_unpromised(self) {
+        let Place::Folder { path, mut file, promised_bytes } = self.place else { return };
+        // A write that still runs would make the file longer again.
+        let _ = file.flush().await;
+        if let Err(error) = file.set_len(promised_bytes).await {
+            tracing::warn!(%error, path = %path.display(), "what was not promised of an upload stays for now");
         }
     }
 }
 
-async fn open_file(path: &std::path::Path, offset_bytes: u64) -> Result<File> {
+async fn open_file(store: &Store, path: &Path, offset_bytes: u64) -> Result<File> {
     let failed = |e| Error::io(path, e);
-    if let Some(folder) = path.parent() {
-        tokio::fs::create_dir_all(folder).await.map_err(failed)?;
-    }
-    let options = std::fs::OpenOptions::new().write(true).create(true).truncate(false).to_owned();
-    let mut file = tokio::fs::OpenOptions::from(options).open(path).await.map_err(failed)?;
+    let mut file = open_or_make(path).await.map_err(failed)?;
     let there = file.metadata().await.map_err(failed)?.len();
     if there < offset_bytes {
         return Err(Error::Internal(format!("{}: {there} bytes are left of {offset_bytes}", path.display())));
@@ -142,48 +163,59 @@ async fn open_file(path: &std::path::Path, offset_bytes: u64) -> Result<File> {
     file.set_len(offset_bytes).await.map_err(failed)?;
     file.seek(SeekFrom::Start(offset_bytes)).await.map_err(failed)?;
     if offset_bytes == 0 {
-        // A file that is promised must have its name, too.
-        let folder = path.parent().unwrap_or(path).to_path_buf();
-        let synced = tokio::task::spawn_blocking(move || std::fs::File::open(folder)?.sync_all()).await;
+        // A file that is promised must have its name, too, and so must the folders above it.
+        let inside = |folder: &&Path| store.folder().is_some_and(|store| folder.starts_with(store));
+        let folders: Vec<PathBuf> = path.ancestors().skip(1).take_while(inside).map(Path::to_path_buf).collect();
+        let sync = move || folders.iter().try_for_each(|folder| std::fs::File::open(folder)?.sync_all());
+        let synced = tokio::task::spawn_blocking(sync).await;
         synced.map_err(|e| Error::Internal(format!("file work stopped: {e}")))?.map_err(failed)?;
     }
     Ok(file)
 }
 
+/// Opens a file, or makes it with the folders above; a clean-up of empty folders beside us may take one away in between.
+async fn open_or_make(path: &Path) -> std::io::Result<File> {
+    const TRIES: usize = 5;
+    let mut tried = 0;
+    loop {
+        if let Some(folder) = path.parent() {
+            tokio::fs::create_dir_all(folder).await?;
+        }
+        let opened = File::options().write(true).create(true).truncate(false).open(path).await;
+        tried += 1;
+        match opened {
+            Err(e) if e.kind() == std::io::ErrorKind::NotFound && tried < TRIES => {}
+            other => return other,
+        }
+    }
+}
+
 impl Parts {
-    async fn open(store: &Store, row: &mut upload::Model, parts: Vec<String>) -> Result<Parts> {
-        let source = source_key(row)?;
-        let name = match &row.parts_name {
-            Some(name) => name.clone(),
-            None => store.begin_parts(&source).await?,
-        };
-        row.parts_name = Some(name.clone());
-        let tail = match row.tail_bytes {
+    async fn open(store: &Store, row: &upload::Model, parts: Vec<String>) -> Result<Parts> {
+        let name = row.parts_name.clone().ok_or_else(|| Error::Internal(format!("upload {} has no parts", row.id)))?;
+        let promised = Tail::of(row);
+        let tail = match promised.bytes {
             0 => Vec::new(),
-            bytes => {
-                store.get_bytes(&Key::upload_part(&row.id, number(row.tail_number)?), to_u64(bytes)).await?.to_vec()
-            }
+            bytes => store.get_bytes(&promised.key(&row.id), to_u64(bytes)).await?.to_vec(),
         };
-        let expected = row.offset_bytes - row.part_bytes * parts.len() as i64;
-        if tail.len() as i64 != expected {
-            return Err(Error::Internal(format!(
-                "upload {}: {} bytes are left of its tail of {expected}",
-                row.id,
-                tail.len()
-            )));
+        let (next_part, there) = (to_i64(parts.len() as u64), to_i64(tail.len() as u64));
+        let expected = row.offset_bytes - row.part_bytes * next_part;
+        if there != expected {
+            let found = format!("upload {}: {there} bytes are left of its tail of {expected}", row.id);
+            return Err(Error::Internal(found));
         }
         Ok(Parts {
             store: store.clone(),
             upload: row.id.clone(),
-            source,
+            source: source_key(row)?,
             name,
             part_bytes: usize::try_from(row.part_bytes).unwrap_or(usize::MAX),
             tail,
-            next_part: parts.len() as i64,
+            next_part,
             new_parts: Vec::new(),
-            tail_number: row.tail_number,
-            tail_kept_bytes: row.tail_bytes,
-            old_tail: Some(row.tail_number),
+            fence: row.fence,
+            kept: promised,
+            promised,
         })
     }
 
@@ -205,41 +237,73 @@ impl Parts {
     }
 
     async fn keep_tail(&mut self) -> Result<()> {
-        if self.tail.is_empty() {
-            self.tail_kept_bytes = 0;
-            return Ok(());
-        }
         // A new name each time: the one before is promised until this one is.
-        self.tail_number += 1;
-        let key = Key::upload_part(&self.upload, number(self.tail_number)?);
-        self.store.put_bytes(&key, Bytes::copy_from_slice(&self.tail)).await?;
-        self.tail_kept_bytes = self.tail.len() as i64;
+        let number = if self.kept.fence == self.fence { self.kept.number + 1 } else { 0 };
+        let next = Tail { fence: self.fence, number, bytes: to_i64(self.tail.len() as u64) };
+        if next.bytes > 0 {
+            self.store.put_bytes(&next.key(&self.upload), Bytes::copy_from_slice(&self.tail)).await?;
+        }
+        self.kept = next;
         Ok(())
     }
 }
 
+/// The name under which an upload's parts are sent, where the store wants one and there is none yet.
+pub(super) async fn begin_parts(store: &Store, row: &upload::Model) -> Result<Option<String>> {
+    if store.folder().is_some() || row.parts_name.is_some() {
+        return Ok(None);
+    }
+    Ok(Some(store.begin_parts(&source_key(row)?).await?))
+}
+
 /// All bytes are there: they become the run's source. Right to do twice.
+///
+/// # Errors
+/// [`Error::Gone`] where they are not there: the source that they became was never recorded and was deleted since.
 pub(super) async fn become_source(
     store: &Store,
     row: &upload::Model,
-    mut parts: Vec<String>,
+    parts: Vec<String>,
     source: Key,
     facts: &Facts,
 ) -> Result<()> {
-    if store.size(&source).await.is_ok_and(|bytes| bytes == facts.bytes) {
+    if !store.size(&source).await.is_ok_and(|bytes| bytes == facts.bytes) {
+        let moved = move_to_source(store, row, parts, &source, facts).await;
+        moved.map_err(|error| if is_missing(&error) { Error::Gone(gone(&row.id)) } else { error })?;
+    }
+    store.sync().await
+}
+
+async fn move_to_source(
+    store: &Store,
+    row: &upload::Model,
+    mut parts: Vec<String>,
+    source: &Key,
+    facts: &Facts,
+) -> Result<()> {
+    if let Some(path) = file_of(store, row) {
+        store.take_known_file(&path, source, facts).await?;
+        if let Some(folder) = path.parent() {
+            // It was this file's own; whoever made something else in it keeps it.
+            let _ = tokio::fs::remove_dir(folder).await;
+        }
         return Ok(());
     }
-    if let Some(path) = file_of(store, row) {
-        store.take_file(&path, &source, facts).await?;
-        return store.sync().await;
-    }
     let name = row.parts_name.clone().ok_or_else(|| Error::Internal(format!("upload {} has no parts", row.id)))?;
-    if row.tail_bytes > 0 {
-        let key = Key::upload_part(&row.id, number(row.tail_number)?);
-        let tail = store.get_bytes(&key, to_u64(row.tail_bytes)).await?;
-        parts.push(store.put_part(&source, &name, number(parts.len() as i64)?, tail).await?);
+    let tail = Tail::of(row);
+    if tail.bytes > 0 {
+        let bytes = store.get_bytes(&tail.key(&row.id), to_u64(tail.bytes)).await?;
+        parts.push(store.put_part(source, &name, number(to_i64(parts.len() as u64))?, bytes).await?);
     }
-    store.finish_parts(&source, &name, parts).await
+    store.finish_parts(source, &name, parts).await
+}
+
+fn is_missing(error: &Error) -> bool {
+    match error {
+        Error::Io { source, .. } => source.kind() == std::io::ErrorKind::NotFound,
+        Error::Store(error) => matches!(error, object_store::Error::NotFound { .. }),
+        _ => false,
+    }
 }
 
 /// Deletes what an upload has in the store.
@@ -252,7 +316,7 @@ pub(super) async fn drop_all(store: &Store, row: &upload::Model) -> Result<()> {
 
 /// Deletes what is not part of the run that an upload became.
 pub(super) async fn drop_tails(store: &Store, row: &upload::Model) -> Result<()> {
-    store.delete_prefix(&prefix_of(row)).await
+    store.delete_prefix(&upload_prefix(&row.id)).await
 }
 
 /// The growing file, where the store is a folder: on the store's own disk, so that a rename is all it takes in the end.
