@@ -113,7 +113,7 @@ struct WatchArgs {
 #[command(next_help_heading = "A live stream")]
 struct LiveArgs {
     /// Send the frames on stdin as they come: MJPEG, as `ffmpeg -f mpjpeg -` writes it, or bare JPEGs one after another
-    #[arg(long, requires = "stream", requires = "live_source")]
+    #[arg(long, requires = "stream")]
     live: bool,
     /// The stream's name: letters, digits, `.`, `_` and `-`
     #[arg(long, value_name = "NAME", requires = "live")]
@@ -196,7 +196,8 @@ impl Send {
             (None, false, true, true) => {
                 let options = watch::Options {
                     settle: Duration::from_secs_f64(positive("--settle-s", self.watching.settle_s, 86_400.0, "s")?),
-                    keep_sent_bytes: gigabytes("--keep-sent-gb", self.watching.keep_sent_gb)?,
+                    keep_sent_bytes: (positive("--keep-sent-gb", self.watching.keep_sent_gb, 1e6, "GB")? * GB as f64)
+                        as u64,
                     delete_sent: self.watching.delete_sent,
                     spool_bytes,
                 };

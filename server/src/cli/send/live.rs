@@ -64,12 +64,14 @@ pub(super) async fn run(desk: &Desk, stream: &str, options: &Options) -> Outcome
         delivered = delivery.all(&older, &own) => delivered,
         ended = delivery.stop_softly(&own) => Err(ended),
     };
-    let gaps = delivered?;
-    match input.await.unwrap_or(Ok(())) {
-        Ok(()) => {}
-        Err(failed) => return Err(failed),
+    let last = delivered?;
+    // After a signal stdin may still be open, and its reader blocked for ever.
+    tokio::select! {
+        biased;
+        read = input => read.unwrap_or(Ok(()))?,
+        () = desk.stop.cancelled() => {}
     }
-    let Some((place, has_gaps)) = gaps else {
+    let Some((place, has_gaps)) = last else {
         return Err(Failed::Input("stdin: held no frame; expected MJPEG, as `ffmpeg -f mpjpeg -` writes it".into()));
     };
     let dropped = own.spool.figures().1;
@@ -199,10 +201,14 @@ impl Delivery<'_> {
             }
         };
         let sent = async {
-            let mut has_gaps = false;
+            let (mut has_gaps, mut last) = (false, None);
             for session in older {
                 match self.one(session).await {
-                    Ok(delivered) => has_gaps |= delivered.is_some_and(|(_, gaps)| gaps),
+                    Ok(Some((place, gaps))) => {
+                        has_gaps |= gaps;
+                        last = Some(place);
+                    }
+                    Ok(None) => {}
                     // It must not stand in the way of today's frames for ever.
                     Err(Failed::Input(why)) => {
                         let place = session.set_aside(&why).map_err(|e| self.local(session, &e))?;
@@ -215,8 +221,11 @@ impl Delivery<'_> {
                     Err(other) => return Err(other),
                 }
             }
-            let last = self.one(own).await?;
-            Ok(last.map(|(place, gaps)| (place, gaps || has_gaps)))
+            if let Some((place, gaps)) = self.one(own).await? {
+                has_gaps |= gaps;
+                last = Some(place);
+            }
+            Ok(last.map(|place| (place, has_gaps)))
         };
         tokio::select! {
             never = told => never,

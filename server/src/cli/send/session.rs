@@ -148,6 +148,9 @@ impl Session {
 
     /// No frame will be added.
     pub(super) fn end_input(&self) -> std::io::Result<()> {
+        if self.lock().ended {
+            return Ok(());
+        }
         self.spool.sync()?;
         self.change(|record| record.ended = true)?;
         self.spool.end();

@@ -104,6 +104,25 @@ struct Progress {
     became: Option<(String, String)>,
 }
 
+/// How it goes forward.
+struct Pace {
+    patience: Patience,
+    /// Bytes that the server has confirmed.
+    furthest: u64,
+    /// Times in a row that the server itself failed.
+    faults: u32,
+}
+
+impl Pace {
+    /// The server has so many bytes. Each cut may bring some: that is progress, too.
+    fn reached(&mut self, offset_bytes: u64) {
+        if offset_bytes > self.furthest {
+            (self.furthest, self.faults) = (offset_bytes, 0);
+            self.patience.progress();
+        }
+    }
+}
+
 /// Sends files.
 pub(super) struct Sender<'a> {
     pub(super) desk: &'a Desk,
@@ -123,26 +142,18 @@ impl Sender<'_> {
 
     async fn keep_sending(&self, source: &Source, recorded_at: Option<jiff::Timestamp>) -> Result<Sent, Trouble> {
         let mut resume = self.resume(source, recorded_at).await?;
-        let (mut patience, mut furthest) = (Patience::new(self.give_up), 0);
-        let (mut beginnings, mut faults) = (1, 0);
+        let mut pace = Pace { patience: Patience::new(self.give_up), furthest: 0, faults: 0 };
+        let mut beginnings = 1;
         loop {
-            let (why, wait) = match self.step(source, &mut resume, recorded_at).await {
+            let (why, wait) = match self.step(source, &mut resume, recorded_at, &mut pace).await {
                 Ok(Progress { became: Some((run, job)), .. }) => {
                     return Ok(Sent { run, job, sha256: resume.sha256 });
                 }
-                Ok(Progress { offset_bytes, .. }) => {
-                    if offset_bytes > furthest {
-                        (furthest, faults) = (offset_bytes, 0);
-                        patience.progress();
-                    }
-                    if offset_bytes < source.bytes {
-                        continue;
-                    }
-                    ("the server has the whole file, but no run yet".to_string(), None)
-                }
+                Ok(Progress { offset_bytes, .. }) if offset_bytes < source.bytes => continue,
+                Ok(_) => ("the server has the whole file, but no run yet".to_string(), None),
                 Err(Trouble::Gone(why)) if resume.upload.is_some() && beginnings < BEGINNINGS => {
                     beginnings += 1;
-                    furthest = 0;
+                    pace.furthest = 0;
                     (resume.key, resume.upload) = (Queue::new_id(), None);
                     self.save(source, &resume)?;
                     (format!("{why}; the upload begins anew"), None)
@@ -153,16 +164,16 @@ impl Sender<'_> {
                     return Err(Trouble::Refused { field: Some("server".into()), words });
                 }
                 Err(Trouble::Passing { why, wait, fault }) => {
-                    faults += u32::from(fault);
-                    if faults >= FAULTS && matches!(self.give_up, GiveUp::Never) {
-                        return Err(Trouble::GaveUp(format!("the server failed {faults} times at it: {why}")));
+                    pace.faults += u32::from(fault);
+                    if pace.faults >= FAULTS && matches!(self.give_up, GiveUp::Never) {
+                        return Err(Trouble::GaveUp(format!("the server failed {FAULTS} times at it: {why}")));
                     }
                     (why, wait)
                 }
                 Err(other) => return Err(other),
             };
             let server = self.desk.contact.server();
-            let Some(pause) = patience.next_wait(wait) else {
+            let Some(pause) = pace.patience.next_wait(wait) else {
                 return Err(Trouble::GaveUp(format!(
                     "{server}: {why}; tried without progress for the whole of --give-up-h. The same command goes on \
                      where this one was"
@@ -215,6 +226,7 @@ impl Sender<'_> {
         source: &Source,
         resume: &mut Resume,
         recorded_at: Option<jiff::Timestamp>,
+        pace: &mut Pace,
     ) -> Result<Progress, Trouble> {
         self.check_unchanged(source)?;
         let contact = &self.desk.contact;
@@ -231,11 +243,14 @@ impl Sender<'_> {
                 (url, known)
             }
         };
+        pace.reached(known.offset_bytes);
         if known.became.is_some() || known.offset_bytes >= source.bytes {
             return Ok(known);
         }
         self.desk.report.begin("sending", &source.name, known.offset_bytes, source.bytes);
-        self.send_from(source, upload, known.offset_bytes).await
+        let known = self.send_from(source, upload, known.offset_bytes).await?;
+        pace.reached(known.offset_bytes);
+        Ok(known)
     }
 
     fn check_unchanged(&self, source: &Source) -> Result<(), Trouble> {

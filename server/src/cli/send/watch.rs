@@ -16,6 +16,8 @@ use super::tus::{Sender, Sent, Source, modified_ns};
 
 /// Pause between two looks at the folder.
 const LOOK_EVERY: Duration = Duration::from_secs(1);
+/// Pause between two looks at how much waits.
+const WARN_EVERY: Duration = Duration::from_secs(10);
 /// A file that could not be read, or at which the server failed, waits this long while others go.
 const LATER: Duration = Duration::from_secs(300);
 /// Held by the one process that watches the folder.
@@ -36,6 +38,15 @@ pub(super) struct Options {
 /// Sends what is in the folder and what comes, until asked to stop.
 pub(super) async fn run(desk: &Desk, folder: &Path, options: &Options) -> Outcome {
     let _lock = lock(folder)?;
+    tokio::select! {
+        ended = send_until_stopped(desk, folder, options) => ended?,
+        () = warn_of_much(desk, folder, options.spool_bytes) => {}
+    }
+    desk.report.idle();
+    Ok(Success::Done)
+}
+
+async fn send_until_stopped(desk: &Desk, folder: &Path, options: &Options) -> Result<(), Failed> {
     let mut watch = Watch {
         desk,
         folder,
@@ -43,7 +54,6 @@ pub(super) async fn run(desk: &Desk, folder: &Path, options: &Options) -> Outcom
         shelves: Shelves::in_folder(folder),
         seen: HashMap::new(),
         later: HashMap::new(),
-        is_over: false,
         denied: Patience::new(GiveUp::Never),
     };
     while !desk.stop.is_cancelled() {
@@ -61,8 +71,28 @@ pub(super) async fn run(desk: &Desk, folder: &Path, options: &Options) -> Outcom
             () = desk.stop.cancelled() => {}
         }
     }
-    desk.report.idle();
-    Ok(Success::Done)
+    Ok(())
+}
+
+/// Says so each time that more begins to wait than a person should not know of; also while no server is there.
+async fn warn_of_much(desk: &Desk, folder: &Path, spool_bytes: u64) {
+    let mut was_over = false;
+    loop {
+        // Whoever sends meets the same fault, and says so.
+        let files = list(folder).unwrap_or_default();
+        let bytes: u64 = files.iter().map(|(_, look)| look.bytes).sum();
+        let over = bytes > spool_bytes;
+        if over && !was_over {
+            desk.report.warning(format!(
+                "{} in {} file(s) wait in {}, more than --spool-gb: they come in faster than they go out",
+                size(bytes),
+                files.len(),
+                folder.display()
+            ));
+        }
+        was_over = over;
+        tokio::time::sleep(WARN_EVERY).await;
+    }
 }
 
 fn lock(folder: &Path) -> Result<File, Failed> {
@@ -94,8 +124,6 @@ struct Watch<'a> {
     seen: HashMap<PathBuf, (Look, Instant)>,
     /// Files that have to wait while others go.
     later: HashMap<PathBuf, Instant>,
-    /// More waits than a person should not know of.
-    is_over: bool,
     denied: Patience,
 }
 
@@ -103,7 +131,6 @@ impl Watch<'_> {
     /// The oldest file that is whole.
     fn next(&mut self) -> std::io::Result<Option<PathBuf>> {
         let files = list(self.folder)?;
-        self.warn_of_much(&files);
         let now = Instant::now();
         let before = std::mem::take(&mut self.seen);
         for (path, look) in &files {
@@ -114,20 +141,6 @@ impl Watch<'_> {
         let whole = |path: &PathBuf| self.seen[path].1 + self.options.settle <= now;
         let ready = files.into_iter().filter(|(path, _)| whole(path) && !self.later.contains_key(path));
         Ok(ready.min_by(|(a, x), (b, y)| (x.modified_ns, a).cmp(&(y.modified_ns, b))).map(|(path, _)| path))
-    }
-
-    fn warn_of_much(&mut self, files: &[(PathBuf, Look)]) {
-        let bytes: u64 = files.iter().map(|(_, look)| look.bytes).sum();
-        let over = bytes > self.options.spool_bytes;
-        if over && !self.is_over {
-            self.desk.report.warning(format!(
-                "{} files with {} wait in {}, more than --spool-gb; they come in faster than they go out",
-                files.len(),
-                size(bytes),
-                self.folder.display()
-            ));
-        }
-        self.is_over = over;
     }
 
     /// Sends one file and puts it where it belongs; how long to wait before the next look.

@@ -169,7 +169,9 @@ async fn send_all(
         }
         if let Some((record, crc)) = waiting.take_if(|(record, _)| place.wire(record.seq) < until) {
             session.sending(record.seq);
-            contact.may_send(FRAME_HEAD_BYTES + record.image.len()).await;
+            if let Err(trouble) = wait_for_turn(&mut sink, contact, FRAME_HEAD_BYTES + record.image.len()).await {
+                return trouble;
+            }
             let message = Message::Binary(frame(place.wire(record.seq), &record, crc));
             if let Err(trouble) = put(&mut sink, message, contact.stall).await {
                 return trouble;
@@ -198,6 +200,17 @@ async fn send_all(
         };
         if is_quiet && let Err(trouble) = put(&mut sink, Message::Ping(Bytes::new()), contact.stall).await {
             return trouble;
+        }
+    }
+}
+
+/// Waits until the cap lets a frame go out; a large one may wait longer than a connection may be silent.
+async fn wait_for_turn(sink: &mut SplitSink<Socket, Message>, contact: &Contact, bytes: usize) -> Result<(), Trouble> {
+    let mut turn = std::pin::pin!(contact.may_send(bytes));
+    loop {
+        tokio::select! {
+            () = &mut turn => return Ok(()),
+            () = tokio::time::sleep(PING_EVERY) => put(sink, Message::Ping(Bytes::new()), contact.stall).await?,
         }
     }
 }
