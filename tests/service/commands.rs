@@ -149,7 +149,7 @@ fn send_waits_for_the_result_and_passes_on_what_went_wrong() {
         (vec!["--rig", "unknown"], 2, "no stored rig"),
         (vec!["--rig", "missing.toml"], 2, "missing.toml"),
         (vec!["--rig", rig, "--recipe", "fast"], 2, "paper"),
-        (vec!["--rig", rig, "--server", "ftp://127.0.0.1:1"], 2, "https://"),
+        (vec!["--rig", rig, "--server", "ftp://127.0.0.1:1"], 2, "http://"),
     ] {
         let failed = if more.contains(&"--server") {
             run_stria(&[&["send", video, "--asset", "Wall"][..], more.as_slice()].concat())

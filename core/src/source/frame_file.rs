@@ -67,6 +67,36 @@ pub fn append_record(out: &mut Vec<u8>, seq: u64, capture_time_ns: i64, image: &
     out.extend(image);
 }
 
+/// What stands before an image.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub struct RecordHead {
+    /// Size of the image, bytes; at most [`MAX_IMAGE_BYTES`].
+    pub image_bytes: usize,
+    /// Its number in the stream.
+    pub seq: u64,
+    /// When it was captured, ns since 1970.
+    pub capture_time_ns: i64,
+    /// The image's CRC-32C.
+    pub image_crc32c: u32,
+}
+
+/// Reads a record's head.
+///
+/// # Errors
+/// In words, where it is none.
+pub fn read_head(head: &[u8; HEAD_BYTES]) -> std::result::Result<RecordHead, &'static str> {
+    let u32_at = |at: usize| u32::from_le_bytes([head[at], head[at + 1], head[at + 2], head[at + 3]]);
+    let u64_at = |at: usize| u64::from(u32_at(at)) | u64::from(u32_at(at + 4)) << 32;
+    if head[..4] != MAGIC || crc32c::crc32c(&head[..28]) != u32_at(28) {
+        return Err("a record does not begin as one");
+    }
+    let image_bytes = u32_at(4) as usize;
+    if image_bytes > MAX_IMAGE_BYTES {
+        return Err("a record is larger than any frame may be");
+    }
+    Ok(RecordHead { image_bytes, seq: u64_at(8), capture_time_ns: u64_at(16) as i64, image_crc32c: u32_at(24) })
+}
+
 /// Reads the records of one file.
 pub struct FrameFile {
     reader: BufReader<File>,
@@ -103,23 +133,18 @@ impl FrameFile {
             HEAD_BYTES => {}
             _ => return self.damaged("it ends within a record"),
         }
-        let u32_at = |at: usize| u32::from_le_bytes([head[at], head[at + 1], head[at + 2], head[at + 3]]);
-        let u64_at = |at: usize| u64::from(u32_at(at)) | u64::from(u32_at(at + 4)) << 32;
-        if head[..4] != MAGIC || crc32c::crc32c(&head[..28]) != u32_at(28) {
-            return self.damaged("a record does not begin as one");
-        }
-        let bytes = u32_at(4) as usize;
-        if bytes > MAX_IMAGE_BYTES {
-            return self.damaged("a record is larger than any frame may be");
-        }
-        let mut image = vec![0; bytes];
-        if self.fill(&mut image) < bytes {
+        let head = match read_head(&head) {
+            Ok(head) => head,
+            Err(how) => return self.damaged(how),
+        };
+        let mut image = vec![0; head.image_bytes];
+        if self.fill(&mut image) < head.image_bytes {
             return self.damaged("it ends within a frame");
         }
-        if crc32c::crc32c(&image) != u32_at(24) {
+        if crc32c::crc32c(&image) != head.image_crc32c {
             return self.damaged("a frame's checksum does not fit");
         }
-        Some(FrameRecord { seq: u64_at(8), capture_time_ns: u64_at(16) as i64, image })
+        Some(FrameRecord { seq: head.seq, capture_time_ns: head.capture_time_ns, image })
     }
 
     /// Reads until the buffer is full or the file ends.

@@ -56,11 +56,17 @@ impl JobBar {
     }
 }
 
+const BYTES: &str = "{prefix:>14} [{bar:30}] {percent:>3} %  {bytes} of {total_bytes}, {bytes_per_sec}, {eta} left";
+const FRAMES: &str = "          live {pos} frames, {per_sec}, {msg}";
+
 /// A bar of bytes on stderr.
 pub(super) fn byte_bar(bytes: u64) -> ProgressBar {
-    ProgressBar::new(bytes).with_style(style(
-        "       sending [{bar:30}] {percent:>3} %  {bytes} of {total_bytes}, {bytes_per_sec}, {eta} left",
-    ))
+    ProgressBar::new(bytes).with_style(style(BYTES))
+}
+
+/// A line on stderr for what has no end yet.
+pub(super) fn live_bar() -> ProgressBar {
+    ProgressBar::no_length().with_style(style(FRAMES))
 }
 
 fn style(template: &str) -> ProgressStyle {
@@ -105,9 +111,7 @@ mod tests {
 
     #[test]
     fn templates_are_sound() {
-        for template in
-            ["{prefix:>14} [{bar:30}] {percent:>3} %  {msg}", "{bytes} of {total_bytes}, {bytes_per_sec}, {eta} left"]
-        {
+        for template in ["{prefix:>14} [{bar:30}] {percent:>3} %  {msg}", BYTES, FRAMES] {
             assert!(ProgressStyle::with_template(template).is_ok(), "{template}");
         }
     }

@@ -1,266 +1,242 @@
-//! `stria send`: a run goes to a server in one request; with `--wait` its job is followed to the end.
+//! `stria send`: runs go to a server whatever the network does. A file, a folder that is watched, or live frames.
+//!
+//! The one rule: what the server has not confirmed stays on this machine, and what it has confirmed is not sent again.
 
-use std::io::{Cursor, Read};
+mod backoff;
+mod contact;
+mod fields;
+mod follow;
+mod live;
+mod report;
+mod sent;
+mod session;
+mod spool;
+mod state;
+mod trouble;
+mod tus;
+mod watch;
+mod websocket;
+
 use std::path::{Path, PathBuf};
-use std::thread::sleep;
-use std::time::{Duration, Instant};
+use std::time::Duration;
 
-use clap::Args;
+use clap::{Args, ValueEnum};
 use reqwest::Url;
-use reqwest::blocking::{Body, Client, Response};
-use serde_json::Value;
+use tokio_util::sync::CancellationToken;
 
-use super::bearer::TokenArgs;
-use super::progress::{JobBar, byte_bar, duration};
+use self::backoff::GiveUp;
+use self::contact::Contact;
+use self::fields::{Fields, RunArgs};
+use self::report::Report;
+use self::state::States;
+use self::trouble::Trouble;
+use self::tus::{Sender, Source};
+use super::engine::{StopSignals, block_on, positive};
 use super::{Failed, Outcome, Success};
+use crate::config::GB;
 
-/// How long a server that does not answer yet is waited for.
-const STARTING: Duration = Duration::from_secs(30);
-/// Pause between two tries.
-const PAUSE: Duration = Duration::from_millis(500);
-/// Tries of the upload itself; the idempotency key makes them safe.
-const UPLOADS: u32 = 3;
-/// Tries to hear of a job while the server does not answer: ten minutes.
-const MISSED_ANSWERS: u32 = 1200;
-/// Longest time for a small answer.
-const ANSWER: Duration = Duration::from_secs(60);
+const EXAMPLES: &str = "\
+Examples:
+  A file; the same command goes on where it was cut off, also after a reboot:
+    stria send run.mp4 --server https://stria.example --asset 'Pipe 7' --rig rig.toml --wait
+  A robot's recordings, as the network allows; confirmed ones move to recordings/sent:
+    stria send recordings --watch --asset 'Pipe 7' --rig gr3 --limit-kbit-s 4000
+  Live from a camera; what cannot be sent now waits on disk and arrives later, in order:
+    ffmpeg -i /dev/video0 -f mpjpeg - |
+      stria send - --live --stream robot7 --asset 'Pipe 7' --rig gr3
 
-/// Send a run to a server
+The token comes from STRIA_TOKEN or --token-file, never from an argument: every user of a machine sees those. Proxies \
+are taken from HTTPS_PROXY and HTTP_PROXY (not by --live), an authority of your own for https from SSL_CERT_FILE. What \
+is needed to go on is kept in $XDG_STATE_HOME/stria, else in ~/.local/state/stria.
+
+Exit codes: 0 done, 1 failed, 2 wrong usage or refused by the server, 3 done with warnings, 130 stopped by a signal.";
+
+/// Send runs to a server: a file, a folder that is watched, or live frames
 #[derive(Args)]
-#[command(
-    after_help = "Example: stria send run.mp4 --server http://127.0.0.1:8420 --asset 'Pipe 7' --rig rig.toml --wait"
-)]
+#[command(after_help = EXAMPLES)]
 pub(super) struct Send {
-    /// The video file
+    /// A video file; a folder with --watch; `-` with --live
     source: PathBuf,
     /// The server's address
     #[arg(long, value_name = "URL", default_value = "http://127.0.0.1:8420", env = "STRIA_SERVER")]
     server: Url,
-    /// The pipe or wall
-    #[arg(long, value_name = "NAME", env = "STRIA_ASSET")]
-    asset: String,
-    /// The rig it was recorded with: a rig file, or the name of a rig that the server has
-    #[arg(long, value_name = "FILE|NAME", env = "STRIA_RIG")]
-    rig: String,
-    /// How to process: a recipe of the server, or a TOML file
-    #[arg(long, value_name = "NAME|FILE", env = "STRIA_RECIPE")]
-    recipe: Option<String>,
-    /// Chainage of the first frame, mm
-    #[arg(long, value_name = "MM", default_value_t = 0.0, allow_negative_numbers = true)]
-    chainage_mm: f64,
-    /// Which way the robot went along the asset
-    #[arg(long, value_parser = ["forward", "backward"], default_value = "forward")]
-    direction: String,
-    /// When it was recorded (RFC 3339); the time of arrival when nothing is said
-    #[arg(long, value_name = "TIME")]
-    recorded_at: Option<jiff::Timestamp>,
-    /// Frames a second, where the source does not say
-    #[arg(long, value_name = "F")]
-    fps: Option<f64>,
-    #[command(flatten)]
-    token: TokenArgs,
+    /// A file that holds the token; else the variable STRIA_TOKEN does
+    #[arg(long, value_name = "FILE", env = "STRIA_TOKEN_FILE")]
+    token_file: Option<PathBuf>,
+    /// Most kilobits a second on the network [default: as fast as it goes]
+    #[arg(long, value_name = "N", value_parser = clap::value_parser!(u32).range(8..=1_000_000))]
+    limit_kbit_s: Option<u32>,
+    /// Give up after so many hours without any progress; --watch never does
+    #[arg(long, value_name = "H", default_value_t = 24.0)]
+    give_up_h: f64,
+    /// A connection on which nothing moves for so many seconds is given up and made anew
+    #[arg(long, value_name = "S", default_value_t = 60.0)]
+    stall_s: f64,
     /// Follow the job to its end and print where to look at the result
-    #[arg(long)]
+    #[arg(long, conflicts_with = "watch")]
     wait: bool,
+    /// Print JSON for programs, one object a line
+    #[arg(long)]
+    json: bool,
+    #[command(flatten)]
+    run: RunArgs,
+    #[command(flatten)]
+    watching: WatchArgs,
+    #[command(flatten)]
+    living: LiveArgs,
+}
+
+/// What only a watched folder has.
+#[derive(Args)]
+#[command(next_help_heading = "A watched folder")]
+struct WatchArgs {
+    /// Send every file of the folder, oldest first, and what comes later, until stopped. Names that begin with a dot or
+    /// end with .part are left alone; what the server refuses moves to refused/, with a .txt that says why
+    #[arg(long, conflicts_with = "live")]
+    watch: bool,
+    /// A file is whole when its size and time have not changed for so many seconds
+    #[arg(long, value_name = "S", default_value_t = 5.0, requires = "watch")]
+    settle_s: f64,
+    /// Delete confirmed files instead of moving them to sent/
+    #[arg(long, requires = "watch", conflicts_with = "keep_sent_gb")]
+    delete_sent: bool,
+    /// Keep so many GB of confirmed files in sent/; beyond it the oldest are deleted
+    #[arg(long, value_name = "GB", default_value_t = 20.0, requires = "watch")]
+    keep_sent_gb: f64,
+    /// With --watch: warn when the files still to be sent pass so many GB. With --live: the most that waits on disk
+    #[arg(long, value_name = "GB", default_value_t = 20.0)]
+    spool_gb: f64,
+}
+
+/// What only a live stream has.
+#[derive(Args)]
+#[command(next_help_heading = "A live stream")]
+struct LiveArgs {
+    /// Send the frames on stdin as they come: MJPEG, as `ffmpeg -f mpjpeg -` writes it, or bare JPEGs one after another
+    #[arg(long, requires = "stream")]
+    live: bool,
+    /// The stream's name: letters, digits, `.`, `_` and `-`
+    #[arg(long, value_name = "NAME", requires = "live")]
+    stream: Option<String>,
+    /// When --spool-gb is reached: wait (stdin is not read on) or drop (new frames are left out and listed as missing)
+    #[arg(long, value_enum, default_value = "wait", requires = "live")]
+    when_full: WhenFull,
+}
+
+/// What happens to frames that find the disk's share full.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, ValueEnum)]
+pub(super) enum WhenFull {
+    Wait,
+    Drop,
+}
+
+/// What every way of sending needs.
+struct Desk {
+    contact: Contact,
+    states: States,
+    report: Report,
+    fields: Fields,
+    stop: CancellationToken,
 }
 
 impl Send {
     pub(super) fn run(self) -> Outcome {
-        if !matches!(self.server.scheme(), "http" | "https") {
-            return Err(Failed::Input(format!("--server {}: expected http:// or https://", self.server)));
+        let report = Report::new(self.json);
+        let outcome = self.send(&report);
+        if let Err(failed) = &outcome {
+            report.failed(failed);
         }
-        // The upload takes as long as it takes; all else has its time.
-        let client =
-            Client::builder().timeout(None).connect_timeout(ANSWER).default_headers(self.token.headers()?).build();
-        let client = client.map_err(|e| Failed::Other(format!("the HTTP client did not start: {e}")))?;
-        self.wait_for_server(&client)?;
-        // Before the bytes: a server that lets nobody in says so at once.
-        answer_of(
-            client
-                .get(self.address("/api/session")?)
-                .timeout(ANSWER)
-                .send()
-                .map_err(|e| Failed::Other(format!("{}: {}", self.server, cause(&e))))?,
-        )?;
-        let run = self.upload(&client)?;
-        let (run_id, job_id) = (text(&run, "/id"), text(&run, "/job/id"));
-        let page = self.address(&format!("/runs/{run_id}"))?;
-        if !self.wait {
-            println!("sent: run {run_id}, job {job_id}\n{page}");
-            return Ok(Success::Done);
-        }
-        let job = self.follow(&client, &job_id)?;
-        self.report(&job, page.as_str())
+        outcome
     }
 
-    fn address(&self, path: &str) -> Result<Url, Failed> {
-        self.server.join(path).map_err(|e| Failed::Input(format!("--server {}: {e}", self.server)))
+    fn send(&self, report: &Report) -> Outcome {
+        let give_up = Duration::from_secs_f64(positive("--give-up-h", self.give_up_h, 1e5, "h")? * 3600.0);
+        let stall = Duration::from_secs_f64(positive("--stall-s", self.stall_s, 86_400.0, "s")?);
+        let desk = Desk {
+            contact: Contact::new(&self.server, self.token_file.as_deref(), self.limit_kbit_s, stall)?,
+            states: States::open(&self.server)?,
+            report: report.clone(),
+            fields: self.run.fields()?,
+            stop: CancellationToken::new(),
+        };
+        if let Some(warning) = desk.contact.warning() {
+            report.warning(warning);
+        }
+        block_on(async {
+            let mut signals = StopSignals::listen().map_err(|e| Failed::Other(format!("signals: {e}")))?;
+            let stop = desk.stop.clone();
+            let heard = tokio::spawn(async move {
+                signals.next().await;
+                stop.cancel();
+                signals.next().await;
+                std::process::exit(130);
+            });
+            let outcome = self.go(&desk, GiveUp::After(give_up)).await;
+            heard.abort();
+            outcome
+        })
     }
 
-    fn wait_for_server(&self, client: &Client) -> Result<(), Failed> {
-        let begun = Instant::now();
-        loop {
-            let error = match client.get(self.address("/readyz")?).timeout(ANSWER).send() {
-                Ok(response) if response.status().is_success() => return Ok(()),
-                Ok(response) => format!("it answers {}", response.status()),
-                Err(e) => cause(&e),
-            };
-            if begun.elapsed() > STARTING {
-                return Err(Failed::Other(format!("{} is not ready: {error}", self.server)));
+    async fn go(&self, desk: &Desk, give_up: GiveUp) -> Outcome {
+        let is_pipe = self.source == Path::new("-");
+        let folder = !is_pipe && self.source.is_dir();
+        let spool_bytes = gigabytes("--spool-gb", self.watching.spool_gb)?;
+        match (&self.living.stream, is_pipe, self.watching.watch, folder) {
+            (Some(stream), true, _, _) => {
+                let options = live::Options { spool_bytes, when_full: self.living.when_full, give_up, wait: self.wait };
+                live::run(desk, stream, &options).await
             }
-            sleep(PAUSE);
-        }
-    }
-
-    fn upload(&self, client: &Client) -> Result<Value, Failed> {
-        let key = crate::queue::Queue::new_id();
-        let mut tries = 0;
-        loop {
-            tries += 1;
-            let (body, content_type, bar) = self.form(&key)?;
-            let request = client.post(self.address("/api/runs")?).header("Content-Type", content_type);
-            let answer = request.header("Idempotency-Key", &key).body(body).send();
-            bar.finish_and_clear();
-            match answer {
-                Ok(response) if response.status().is_server_error() && tries < UPLOADS => sleep(4 * PAUSE),
-                Ok(response) => return answer_of(response),
-                Err(e) if tries >= UPLOADS => return Err(Failed::Other(format!("{}: {}", self.server, cause(&e)))),
-                Err(e) => {
-                    eprintln!("stria: the connection broke ({}); trying again", cause(&e));
-                    sleep(4 * PAUSE);
-                }
+            (Some(_), false, _, _) => self.wrong("expected `-`: --live reads the frames from stdin"),
+            (None, true, _, _) => self.wrong("stdin is sent with --live --stream NAME"),
+            (None, false, true, false) => self.wrong("is no folder; --watch expected one"),
+            (None, false, false, true) => self.wrong(
+                "is a folder; expected a video file, or --watch to send the files in it (a folder of images can be \
+                 processed here with `stria process`)",
+            ),
+            (None, false, true, true) => {
+                let options = watch::Options {
+                    settle: Duration::from_secs_f64(positive("--settle-s", self.watching.settle_s, 86_400.0, "s")?),
+                    keep_sent_bytes: (positive("--keep-sent-gb", self.watching.keep_sent_gb, 1e6, "GB")? * GB as f64)
+                        as u64,
+                    delete_sent: self.watching.delete_sent,
+                    spool_bytes,
+                };
+                watch::run(desk, &self.source, &options).await
             }
+            (None, false, false, false) => self.send_file(desk, give_up).await,
         }
     }
 
-    /// The form of the upload; the file is read while it is sent.
-    fn form(&self, boundary: &str) -> Result<(Body, String, indicatif::ProgressBar), Failed> {
-        let unreadable = |e: std::io::Error| Failed::Input(format!("{}: {e}", self.source.display()));
-        let file = std::fs::File::open(&self.source).map_err(unreadable)?;
-        let facts = file.metadata().map_err(unreadable)?;
-        if facts.is_dir() {
-            let hint = "a folder of images can be processed here with `stria process`";
-            return Err(Failed::Input(format!(
-                "{}: is a folder; expected a video file ({hint})",
-                self.source.display()
-            )));
-        }
-        let name = self.source.file_name().map(|n| n.to_string_lossy().into_owned()).unwrap_or_default();
-        let mut fields = vec![
-            ("asset", self.asset.clone()),
-            ("rig", file_or_name(&self.rig)?),
-            ("chainage_mm", self.chainage_mm.to_string()),
-            ("direction", self.direction.clone()),
-            ("filename", name),
-        ];
-        fields.extend(self.recipe.as_deref().map(file_or_name).transpose()?.map(|text| ("recipe", text)));
-        fields.extend(self.recorded_at.map(|time| ("recorded_at", time.to_string())));
-        fields.extend(self.fps.map(|fps| ("fps", fps.to_string())));
-        let mut head = String::new();
-        for (name, value) in fields {
-            head += &format!("--{boundary}\r\nContent-Disposition: form-data; name=\"{name}\"\r\n\r\n{value}\r\n");
-        }
-        head += &format!("--{boundary}\r\nContent-Disposition: form-data; name=\"file\"; filename=\"source\"\r\n\r\n");
-        let tail = format!("\r\n--{boundary}--\r\n");
-        let bytes = head.len() as u64 + facts.len() + tail.len() as u64;
-        let bar = byte_bar(bytes);
-        let whole = Cursor::new(head).chain(file.take(facts.len())).chain(Cursor::new(tail));
-        let body = Body::sized(bar.wrap_read(whole), bytes);
-        Ok((body, format!("multipart/form-data; boundary={boundary}"), bar))
+    fn wrong(&self, words: &str) -> Outcome {
+        Err(Failed::Input(format!("{}: {words}", self.source.display())))
     }
 
-    /// Looks at the job until it ends; a server that restarts meanwhile is waited for.
-    fn follow(&self, client: &Client, job: &str) -> Result<Value, Failed> {
-        let (bar, mut missed) = (JobBar::new(), 0);
-        let address = self.address(&format!("/api/jobs/{job}"))?;
-        loop {
-            match client.get(address.clone()).timeout(ANSWER).send() {
-                Ok(response) if !response.status().is_server_error() => {
-                    missed = 0;
-                    let job = answer_of(response)?;
-                    let number = |name: &str| job.pointer(name).and_then(Value::as_f64);
-                    let state = text(&job, "/state");
-                    let stage = if state == "running" { text(&job, "/stage") } else { state.clone() };
-                    let total = job.pointer("/frames_total").and_then(Value::as_u64);
-                    let frames = job.pointer("/frames").and_then(Value::as_u64).unwrap_or(0);
-                    let (fraction, rate) = (number("/progress").unwrap_or(0.0), number("/frames_per_s").unwrap_or(0.0));
-                    bar.show(&stage, fraction, frames, total, rate, number("/time_left_s"));
-                    if matches!(state.as_str(), "done" | "failed" | "cancelled") {
-                        bar.clear();
-                        return Ok(job);
-                    }
-                }
-                other => {
-                    missed += 1;
-                    if missed > MISSED_ANSWERS {
-                        let why = other.map_or_else(|e| cause(&e), |r| format!("it answers {}", r.status()));
-                        return Err(Failed::Other(format!("{} is gone: {why}", self.server)));
-                    }
-                }
-            }
-            sleep(PAUSE);
+    async fn send_file(&self, desk: &Desk, give_up: GiveUp) -> Outcome {
+        let source = Source::open(&self.source)?;
+        source.lock()?;
+        let sender = Sender { desk, give_up };
+        let sent = sender.send(&source, self.run.recorded_at).await;
+        if let Err(Trouble::Refused { .. } | Trouble::Changed(_)) = &sent {
+            desk.states.forget(&source);
         }
-    }
-
-    fn report(&self, job: &Value, page: &str) -> Outcome {
-        match text(job, "/state").as_str() {
-            "done" => {}
-            "cancelled" => return Err(Failed::Cancelled),
-            _ => return Err(Failed::Other(format!("the job failed: {}\n{page}", text(job, "/error/detail")))),
+        let sent = sent?;
+        let page = desk.contact.page(&sent.run);
+        desk.report.sent(&source.name, source.bytes, &sent.run, &sent.job, page.as_str());
+        let outcome =
+            if self.wait { follow::follow(desk, &sent.run, &sent.job, give_up).await } else { Ok(Success::Done) };
+        // Only now: until its result was said, the same command finds this run again instead of making another.
+        if !matches!(outcome, Err(Failed::Cancelled)) || !self.wait {
+            desk.states.forget(&source);
         }
-        let time = |name: &str| text(job, name).parse::<jiff::Timestamp>().ok();
-        let took = time("/finished_at").zip(time("/started_at")).map(|(b, a)| b.duration_since(a).as_secs_f64());
-        let frames = job.pointer("/frames").and_then(Value::as_u64).unwrap_or(0);
-        println!("Done: {frames} frames in {}", duration(took.unwrap_or(0.0)));
-        let warnings = job.pointer("/warnings").and_then(Value::as_array).cloned().unwrap_or_default();
-        for warning in warnings.iter().filter_map(Value::as_str) {
-            println!("warning: {warning}");
-        }
-        println!("{page}");
-        Ok(if warnings.is_empty() { Success::Done } else { Success::DoneWithWarnings })
+        outcome
     }
 }
 
-/// The text of a file where there is one of that name, else the name.
-fn file_or_name(text: &str) -> Result<String, Failed> {
-    let path = Path::new(text);
-    if path.is_file() {
-        return std::fs::read_to_string(path).map_err(|e| Failed::Input(format!("{text}: {e}; expected a text file")));
+fn gigabytes(name: &str, value: f64) -> Result<u64, Failed> {
+    /// Several of the largest frames must find room.
+    const LEAST_GB: f64 = 0.2;
+    if value < LEAST_GB {
+        return Err(Failed::Input(format!("{name} is {value} GB; expected at least {LEAST_GB} GB")));
     }
-    if path.extension().is_some() || text.contains('/') {
-        return Err(Failed::Input(format!("{text}: there is no such file")));
-    }
-    Ok(text.into())
-}
-
-/// JSON, or the problem in words.
-fn answer_of(response: Response) -> Result<Value, Failed> {
-    let (status, url) = (response.status(), response.url().clone());
-    let body: Value = response.json().map_err(|e| Failed::Other(format!("{url}: {}", cause(&e))))?;
-    if status.is_success() {
-        return Ok(body);
-    }
-    let expected = body.get("expected").and_then(Value::as_str).map(|e| format!("; expected {e}")).unwrap_or_default();
-    if status == reqwest::StatusCode::UNAUTHORIZED {
-        let hint = "expected a token in STRIA_TOKEN or --token-file; the server's `stria token create` makes one";
-        return Err(Failed::Input(format!("{url}: {}; {hint}", text(&body, "/detail"))));
-    }
-    let detail = text(&body, "/detail");
-    // The core's messages say what they expected themselves.
-    let words = if detail.contains(&expected) { detail } else { detail + &expected };
-    let message = format!("the server refuses the run ({status}): {words}");
-    Err(if status.is_client_error() { Failed::Input(message) } else { Failed::Other(message) })
-}
-
-fn text(value: &Value, pointer: &str) -> String {
-    value.pointer(pointer).and_then(Value::as_str).unwrap_or_default().into()
-}
-
-/// The innermost cause says most: "connection refused" instead of "error sending request".
-fn cause(error: &reqwest::Error) -> String {
-    let mut inner: &dyn std::error::Error = error;
-    while let Some(next) = inner.source() {
-        inner = next;
-    }
-    inner.to_string()
+    Ok((positive(name, value, 1e6, "GB")? * GB as f64) as u64)
 }
