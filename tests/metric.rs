@@ -7,6 +7,7 @@ use std::path::Path;
 
 use stria_core::export::{cloud_ply, manifest::Manifest, npy, trajectory_csv};
 use stria_core::geometry::WorldFromCamera;
+use stria_core::defects::Chainage;
 use stria_core::pipeline::{ProductGroup, Request, process};
 use stria_core::recipe::Recipe;
 use stria_core::synthetic::{FrameTruth, Motion, Quality, Scene, Simulation, VideoWriter};
@@ -49,6 +50,7 @@ fn measure(scene: Scene, seconds: f64, fps: f64, seed: u64, laser_on: impl Fn(u3
         fps: None,
         poses: None,
         recorded_at: jiff::Timestamp::UNIX_EPOCH,
+        chainage: Chainage::default(),
         rig: simulation.rig().clone(),
         recipe,
         out_dir: out_dir.clone(),

@@ -6,7 +6,9 @@
 
 pub mod archive_mcap;
 pub(crate) mod canvas;
+pub mod change_list;
 pub mod cloud_ply;
+pub mod defect_list;
 pub mod depth_png;
 pub mod depth_tif;
 pub mod live_frame;
@@ -16,6 +18,8 @@ pub mod npy;
 pub mod parts;
 pub mod preview;
 mod pyramid;
+pub mod residual_tif;
+pub mod sections_csv;
 pub mod texture;
 pub mod tiles;
 pub mod trajectory_csv;

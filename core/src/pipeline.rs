@@ -19,6 +19,7 @@ use std::time::{Duration, Instant};
 use nalgebra::Point3;
 use serde::{Deserialize, Serialize};
 
+use crate::defects::Chainage;
 use crate::depth_map::sheet::WallColours;
 use crate::depth_map::strips::TextureStrip;
 use crate::error::{Error, Result};
@@ -52,19 +53,22 @@ pub enum ProductGroup {
     Trajectory,
     /// `recording.rrd`.
     Recording,
+    /// `defects.json`, `defects.csv`, `sections.csv`, `residual.tif`.
+    Defects,
     /// `archive.mcap`.
     Archive,
 }
 
 impl ProductGroup {
     /// All groups.
-    pub const ALL: [ProductGroup; 8] = [
+    pub const ALL: [ProductGroup; 9] = [
         ProductGroup::Depth,
         ProductGroup::Texture,
         ProductGroup::Preview,
         ProductGroup::Tiles,
         ProductGroup::Cloud,
         ProductGroup::Trajectory,
+        ProductGroup::Defects,
         ProductGroup::Recording,
         ProductGroup::Archive,
     ];
@@ -80,6 +84,8 @@ pub struct Request {
     pub fps: Option<f64>,
     /// When the run's first frame was captured: the archive's and the recording's times count from it.
     pub recorded_at: jiff::Timestamp,
+    /// Where the run lies on its asset.
+    pub chainage: Chainage,
     /// The rig it was recorded with.
     pub rig: Rig,
     /// How to process it.

@@ -1,10 +1,12 @@
 //! The products of a job: what is written while the frames go by, and what is written at the end.
 
 use std::path::Path;
+use std::time::{Duration, Instant};
 
 use super::progress::Progress;
 use super::quality::QualityCounter;
 use super::{Cargo, Colours, Event, Newest, ProductGroup, Request, Timings};
+use crate::defects::{self, Chainage, Findings};
 use crate::depth_map::sheet::Sheet;
 use crate::depth_map::strips::{add_strip, strip_grid};
 use crate::depth_map::{FinishedMap, Grid, MapReader, SharedMap, SurfaceMap};
@@ -19,8 +21,10 @@ use crate::export::npy::NpyWriter;
 use crate::export::preview::{self, Picture, PreviewText};
 use crate::export::tiles::{TileGrid, TileWriter};
 use crate::export::trajectory_csv::{TrajectoryRow, TrajectoryWriter};
-use crate::export::{depth_png, depth_tif, texture};
+use crate::export::residual_tif::{self, ResidualWriter};
+use crate::export::{defect_list, depth_png, depth_tif, sections_csv, texture};
 use crate::motion::track::TrackUse;
+use crate::recipe::DefectOptions;
 use crate::recording::{FrameSteps, RecordedRun, Recorder, Segment};
 use crate::rig::{LineDirection, Rig};
 use crate::source::{self, SourceInfo, encoded_frames};
@@ -115,14 +119,17 @@ impl<'a> Products<'a> {
     /// Whether any product shows the wall's colours.
     pub(super) fn wants_colours(&self) -> bool {
         // The depth maps alone, the trajectory and the stripes have none.
-        let coloured = |group: &ProductGroup| !matches!(group, ProductGroup::Depth | ProductGroup::Trajectory);
+        let coloured = |group: &ProductGroup| {
+            !matches!(group, ProductGroup::Depth | ProductGroup::Trajectory | ProductGroup::Defects)
+        };
         self.request.products.iter().any(coloured)
     }
 
     /// Whether any product shows the wall's colours between the profiles too.
     pub(super) fn wants_wall_colours(&self) -> bool {
         let shows = |group: &ProductGroup| {
-            !matches!(group, ProductGroup::Depth | ProductGroup::Trajectory | ProductGroup::Cloud)
+            use ProductGroup::{Cloud, Defects, Depth, Trajectory};
+            !matches!(group, Depth | Trajectory | Cloud | Defects)
         };
         self.request.products.iter().any(shows)
     }
@@ -276,7 +283,12 @@ impl<'a> Products<'a> {
         let coverage = finished.as_ref().map_or(0.0, FinishedMap::coverage);
         let (quality, gaps, resolution) = quality.finish(&request.rig, coverage);
         warn_of_quality(&quality, &gaps, request, progress)?;
-        let (gray, picture) = timings.time("maps", || self.write_maps(finished.as_mut(), progress))?;
+        let profile_step_mm = resolution.and_then(|r| r.r_lateral_mm).unwrap_or(0.0);
+        let Maps { gray, picture, found } =
+            timings.time("maps", || self.write_maps(finished.as_mut(), profile_step_mm, progress))?;
+        if let Some((_, time)) = found {
+            timings.add("defects", time);
+        }
         if let Some(trajectory) = self.trajectory.take() {
             progress.step("trajectory")?;
             trajectory.finish()?;
@@ -322,20 +334,24 @@ impl<'a> Products<'a> {
         Ok(manifest)
     }
 
-    /// Writes the maps, two at a time: both halves squeeze the whole map, each on its own core. Returns the gray values
-    /// of `depth.png`, and the picture for people.
+    /// Writes the maps, two at a time: both halves squeeze the whole map, each on its own core. Meanwhile the defects
+    /// are looked for.
     fn write_maps(
         &mut self,
         map: Option<&mut FinishedMap<'_>>,
+        profile_step_mm: f64,
         progress: &mut Progress<'_, '_>,
-    ) -> Result<(Option<GrayScale>, Option<Picture>)> {
-        let Some(map) = map else { return Ok((None, None)) };
+    ) -> Result<Maps> {
+        let Some(map) = map else { return Ok(Maps::default()) };
         let (folder, wanted) = (&self.request.out_dir, &self.request.products);
         let wants = |group| wanted.contains(&group);
         let text = self.preview_text();
         let tiles = self.tiles.take();
+        let (options, chainage) = (&self.request.recipe.defects, self.request.chainage);
         let shared = SharedMap::new(map);
         std::thread::scope(|scope| {
+            let searching = wants(ProductGroup::Defects)
+                .then(|| scope.spawn(|| find_defects(&mut shared.reader(), options, chainage, profile_step_mm, folder)));
             let beside = scope.spawn(|| -> Result<Option<Picture>> {
                 if wants(ProductGroup::Depth) {
                     depth_tif::write(&mut shared.reader(), &folder.join("depth.tif"))?;
@@ -367,12 +383,23 @@ impl<'a> Products<'a> {
                 progress.step("preview")?;
             }
             let picture = beside.join().map_err(|_| Error::internal("maps", "a thread panicked"))??;
-            Ok((gray, picture))
+            let found = match searching {
+                Some(searching) => {
+                    progress.step("defects")?;
+                    searching.join().map_err(|_| Error::internal("defects", "a thread panicked"))??
+                }
+                None => None,
+            };
+            Ok(Maps { gray, picture, found })
         })
     }
 
     fn preview_text(&self) -> PreviewText {
-        PreviewText { title: self.request.source_name.clone(), ..PreviewText::default() }
+        PreviewText {
+            title: self.request.source_name.clone(),
+            start_chainage_mm: self.request.chainage.start_mm,
+            chainage_falls: self.request.chainage.falls,
+        }
     }
 
     /// Completes the archive: the frames as they were given, the map, and what is attached. Returns what
@@ -426,6 +453,35 @@ impl<'a> Products<'a> {
         let segments = recorder.finish()?;
         self.announcements(segments).into_iter().try_for_each(|event| progress.send(event))
     }
+}
+
+/// What writing the maps leaves.
+#[derive(Default)]
+struct Maps {
+    /// The gray values of `depth.png`.
+    gray: Option<GrayScale>,
+    /// The picture for people.
+    picture: Option<Picture>,
+    /// The defects, and how long it took to find them.
+    found: Option<(Findings, Duration)>,
+}
+
+/// Depth map ▶ defects ▶ their files; `None` where too little was measured.
+fn find_defects(
+    map: &mut dyn MapReader,
+    options: &DefectOptions,
+    chainage: Chainage,
+    profile_step_mm: f64,
+    folder: &Path,
+) -> Result<Option<(Findings, Duration)>> {
+    let start = Instant::now();
+    let mut residual = ResidualWriter::new(folder, residual_tif::NAME);
+    let found = defects::find(map, options, chainage, profile_step_mm, &mut |strip| residual.push(strip))?;
+    let Some(findings) = found else { return Ok(None) };
+    residual.finish()?;
+    defect_list::write(&findings.list, folder)?;
+    sections_csv::write(&findings.sections, folder)?;
+    Ok(Some((findings, start.elapsed())))
 }
 
 fn make<T>(wanted: bool, create: impl FnOnce() -> Result<T>) -> Result<Option<T>> {

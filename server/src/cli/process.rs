@@ -8,6 +8,7 @@ use std::sync::atomic::{AtomicBool, Ordering};
 use std::time::Instant;
 
 use clap::Args;
+use stria_core::defects::Chainage;
 use stria_core::export::manifest::Manifest;
 use stria_core::pipeline::{self, Event, ProductGroup, Request};
 use stria_core::recipe::{self, OptionInfo, Range, Recipe};
@@ -61,6 +62,12 @@ pub(super) struct Process {
     /// When the run was recorded (RFC 3339); when nothing is said, the time of the file
     #[arg(long, value_name = "TIME")]
     recorded_at: Option<jiff::Timestamp>,
+    /// Chainage of the run's first frame, mm
+    #[arg(long, value_name = "MM", default_value_t = 0.0, allow_negative_numbers = true)]
+    chainage_mm: f64,
+    /// Which way the robot went along the asset: backward, the chainage falls
+    #[arg(long, value_parser = ["forward", "backward"], default_value = "forward")]
+    direction: String,
     /// The name of the source in messages and the manifest
     #[arg(long, hide = true)]
     name: Option<String>,
@@ -121,14 +128,7 @@ impl Process {
         let rig = Rig::load(&self.rig)?;
         let mut recipe = Recipe::load(&self.recipe)?;
         for change in &self.set {
-            let Some((key, value)) = change.split_once('=') else {
-                return Err(stria_core::Error::input(
-                    format!("--set {change}"),
-                    "no '='",
-                    "key=value, such as stripe.k=0.8",
-                ));
-            };
-            recipe.set(key.trim(), value.trim())?;
+            recipe.set_pair(change)?;
         }
         refuse_used_folder(&self.out)?;
         let name = self.source.file_name().map(|n| n.to_string_lossy().into_owned());
@@ -138,6 +138,7 @@ impl Process {
             source_name: self.name.clone().or(name).unwrap_or_else(|| self.source.display().to_string()),
             fps: self.fps,
             recorded_at: self.recorded_at.unwrap_or_else(|| time_of(&self.source)),
+            chainage: Chainage { start_mm: self.chainage_mm, falls: self.direction == "backward" },
             rig,
             recipe,
             poses: self.poses.clone(),
