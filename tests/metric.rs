@@ -5,9 +5,9 @@
 use std::ops::ControlFlow;
 use std::path::Path;
 
+use stria_core::defects::Chainage;
 use stria_core::export::{cloud_ply, manifest::Manifest, npy, trajectory_csv};
 use stria_core::geometry::WorldFromCamera;
-use stria_core::defects::Chainage;
 use stria_core::pipeline::{ProductGroup, Request, process};
 use stria_core::recipe::Recipe;
 use stria_core::synthetic::{FrameTruth, Motion, Quality, Scene, Simulation, VideoWriter};
@@ -50,6 +50,7 @@ fn measure(scene: Scene, seconds: f64, fps: f64, seed: u64, laser_on: impl Fn(u3
         fps: None,
         poses: None,
         recorded_at: jiff::Timestamp::UNIX_EPOCH,
+        asset: String::new(),
         chainage: Chainage::default(),
         rig: simulation.rig().clone(),
         recipe,

@@ -223,6 +223,8 @@ pub struct SectionRow {
 /// How well the surface was seen.
 #[derive(Clone, Copy, Debug, PartialEq, Serialize, Deserialize)]
 pub struct Inspected {
+    /// World x where the map begins, mm.
+    pub x_min_mm: f64,
     /// Length of the map, mm.
     pub length_mm: f64,
     /// Height of the map, mm.
@@ -254,6 +256,8 @@ pub struct DefectList {
     pub noise_mm: f64,
     /// Size of the cells that were searched, mm.
     pub cell_mm: f64,
+    /// Mean travel from one profile to the next, mm: what is not much longer may be a single one's error, and is not listed.
+    pub profile_step_mm: f64,
     /// The undamaged shape.
     pub reference: ReferenceShape,
     /// What was looked at.
@@ -351,7 +355,7 @@ pub fn find(
     if gathered.measured_cells == 0 {
         return Ok(None);
     }
-    Ok(Some(gathered.findings(&grid, options, chainage, (shape, radius_sd_mm), wave_mm)))
+    Ok(Some(gathered.findings(&grid, options, chainage, (shape, radius_sd_mm), [wave_mm, profile_step_mm])))
 }
 
 /// The median z of some columns, mm.
@@ -421,7 +425,7 @@ impl Gathered {
         options: &DefectOptions,
         chainage: Chainage,
         (shape, radius_sd_mm): (Shape, Option<f64>),
-        wave_mm: f64,
+        [wave_mm, profile_step_mm]: [f64; 2],
     ) -> Findings {
         let omitted = self.keep_the_deepest(options.list_max as usize);
         for defect in &mut self.defects {
@@ -447,8 +451,15 @@ impl Gathered {
             depth_min_mm: options.depth_min_mm,
             noise_mm,
             cell_mm: grid.cell_mm,
+            profile_step_mm,
             reference: self.reference(shape, radius_sd_mm, wave_mm),
-            inspected: Inspected { length_mm, height_mm, area_mm2, coverage: area_mm2 / (length_mm * height_mm) },
+            inspected: Inspected {
+                x_min_mm: grid.x_mm(-0.5),
+                length_mm,
+                height_mm,
+                area_mm2,
+                coverage: area_mm2 / (length_mm * height_mm),
+            },
             doubtful: self.doubtful,
             omitted,
             defects: self.defects,
@@ -470,9 +481,8 @@ impl Gathered {
         let most = self.seen.iter().map(|s| s.0).max().unwrap_or(0);
         let matter = self.seen.iter().filter(|s| 4 * s.0 >= most);
         let worst_of = |pick: &dyn Fn(&[(f64, f64); 2]) -> f64| matter.clone().map(|s| pick(&s.1)).fold(0.0, f64::max);
-        let limits = |first: f64, last: f64| {
-            noise::limits(&[(first, FIRST_LENGTH * wave_mm), (last, wave_mm)], grid.cell_mm)
-        };
+        let limits =
+            |first: f64, last: f64| noise::limits(&[(first, FIRST_LENGTH * wave_mm), (last, wave_mm)], grid.cell_mm);
         (limits(worst_of(&|t| t[0].0), worst_of(&|t| t[1].0)), limits(worst_of(&|t| t[0].1), worst_of(&|t| t[1].1)))
     }
 
@@ -489,7 +499,8 @@ impl Gathered {
                 wave_mm,
             },
             Shape::Cylinder { radius_mm, from_outside } => {
-                let all = |pick: &dyn Fn(&SectionRow) -> Option<f64>| pooled(self.sections.iter().filter_map(pick).collect());
+                let all =
+                    |pick: &dyn Fn(&SectionRow) -> Option<f64>| pooled(self.sections.iter().filter_map(pick).collect());
                 let radius = all(&|s| s.radius_mm);
                 let ovality = all(&|s| s.ovality_percent);
                 // The sections' own errors, too, shrink with their number.

@@ -18,6 +18,7 @@ pub mod npy;
 pub mod parts;
 pub mod preview;
 mod pyramid;
+pub mod report;
 pub mod residual_tif;
 pub mod sections_csv;
 pub mod texture;

@@ -57,11 +57,13 @@ pub enum ProductGroup {
     Defects,
     /// `archive.mcap`.
     Archive,
+    /// `report.html`, and what it rests on: the files of [`ProductGroup::Defects`].
+    Report,
 }
 
 impl ProductGroup {
     /// All groups.
-    pub const ALL: [ProductGroup; 9] = [
+    pub const ALL: [ProductGroup; 10] = [
         ProductGroup::Depth,
         ProductGroup::Texture,
         ProductGroup::Preview,
@@ -71,6 +73,7 @@ impl ProductGroup {
         ProductGroup::Defects,
         ProductGroup::Recording,
         ProductGroup::Archive,
+        ProductGroup::Report,
     ];
 }
 
@@ -84,6 +87,8 @@ pub struct Request {
     pub fps: Option<f64>,
     /// When the run's first frame was captured: the archive's and the recording's times count from it.
     pub recorded_at: jiff::Timestamp,
+    /// The name of the asset, for the report; empty where nobody said.
+    pub asset: String,
     /// Where the run lies on its asset.
     pub chainage: Chainage,
     /// The rig it was recorded with.

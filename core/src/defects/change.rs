@@ -12,8 +12,8 @@ use super::cells::Field;
 use super::measure::{Stretch, measure};
 use super::noise::Noise;
 use super::reference::Reference;
-use super::register::{Registration, register};
 use super::regions;
+use super::register::{Registration, register};
 use super::stretch::{self, COARSE, FIRST_LENGTH};
 use super::{CellGrid, Defect, DefectList, MARGIN_COLUMNS, ResidualStrip, SMOOTHING_CELLS};
 use crate::depth_map::MapReader;
@@ -25,6 +25,10 @@ pub const SCHEMA_VERSION: u32 = 1;
 
 /// Columns of cells that are compared at once.
 const CORE_COLUMNS: usize = 2048;
+/// How much farther than a defect a change must rise above the scatter: two runs err, and nothing shall be claimed lightly.
+const STRICTER: f64 = 1.15;
+/// Smoothing of the difference before the search, cells: what two runs do not share is mostly fine.
+const CHANGE_SMOOTHING_CELLS: f32 = 1.8;
 /// Standard deviations of the level of detection: 95 % of what does not change stays below.
 const LEVEL_SIGMAS: f64 = 1.96;
 
@@ -160,7 +164,8 @@ pub fn compare(
         false => before.list.start_chainage_mm - after.list.start_chainage_mm,
         true => after.list.start_chainage_mm - before.list.start_chainage_mm,
     };
-    let (grid, other) = (CellGrid::of_cells(&before.residual.geometry()), CellGrid::of_cells(&after.residual.geometry()));
+    let (grid, other) =
+        (CellGrid::of_cells(&before.residual.geometry()), CellGrid::of_cells(&after.residual.geometry()));
     let noise_mm = before.list.noise_mm.max(after.list.noise_mm) as f32;
     let registration = register(&grid, before.residual, &other, after.residual, shift_mm, noise_mm)?;
     let mut found = Vec::new();
@@ -171,7 +176,8 @@ pub fn compare(
         let columns = start.saturating_sub(MARGIN_COLUMNS)..(core.end + MARGIN_COLUMNS).min(grid.columns);
         let earlier = grid.read(before.residual, columns.start, columns.len())?;
         let later = registration.read(&grid, &columns, &other, after.residual)?;
-        let stretch = Difference::new(&grid, columns, &earlier, &later, before.list, registration.sd_mm(), options);
+        let mut stretch = Difference::new(&grid, columns, &earlier, &later, before.list, registration.sd_mm(), options);
+        stretch.profile_step_mm = before.list.profile_step_mm.max(after.list.profile_step_mm);
         take(&ResidualStrip {
             origin_mm: (grid.x0_mm, grid.y0_mm),
             cell_mm: grid.cell_mm,
@@ -206,6 +212,8 @@ struct Difference {
     search: Search,
     near_gap: Vec<bool>,
     wave_mm: f64,
+    /// The longer of both runs' ways between profiles, mm.
+    profile_step_mm: f64,
 }
 
 /// The difference from a background, and what stands out of it.
@@ -233,7 +241,7 @@ impl Search {
         let fine = refined(background, COARSE, raw.columns, raw.rows);
         let mut off = raw.clone();
         off.values.iter_mut().zip(&fine.values).for_each(|(v, b)| *v -= b);
-        let smooth = off.smoothed(SMOOTHING_CELLS, stretch::SMOOTH_SHARE);
+        let smooth = off.smoothed(CHANGE_SMOOTHING_CELLS, stretch::SMOOTH_SHARE);
         let free = stretch::free(&off, masked);
         // The even surface's own scatter first: slopes are not it.
         let even: Vec<bool> = free.iter().zip(slopes).map(|(free, slope)| *free && *slope < EVEN_SLOPE).collect();
@@ -242,7 +250,8 @@ impl Search {
         let mut even = smooth.clone();
         even.values.iter_mut().zip(&slack).for_each(|(v, s)| *v /= s);
         let noise = Noise::of(&even, &free, masked.is_some());
-        let threshold = |sigma: &f32| (options.noise_factor as f32 * sigma).max(options.depth_min_mm as f32);
+        let threshold =
+            |sigma: &f32| ((STRICTER * options.noise_factor) as f32 * sigma).max(options.depth_min_mm as f32);
         let thresholds_mm: Vec<f32> = noise.rows_mm.iter().map(threshold).collect();
         let regions = regions::find(&even, &thresholds_mm);
         Search { off, smooth, slack, noise, thresholds_mm, regions }
@@ -277,12 +286,18 @@ impl Difference {
             background = plate(&coarse, &weights, stiffness(wave_cells));
             search = Search::against(&raw, &background, &slopes, sd_mm, options, Some(&masked));
         }
-        Difference { columns, search, near_gap, wave_mm }
+        Difference { columns, search, near_gap, wave_mm, profile_step_mm: 0.0 }
     }
 
     fn core(&self, core: &std::ops::Range<usize>) -> Vec<f32> {
         let (from, columns) = (core.start - self.columns.start, core.len());
-        self.search.off.values.chunks_exact(self.search.off.columns).flat_map(|line| &line[from..from + columns]).copied().collect()
+        self.search
+            .off
+            .values
+            .chunks_exact(self.search.off.columns)
+            .flat_map(|line| &line[from..from + columns])
+            .copied()
+            .collect()
     }
 
     fn typical_mm(&self) -> f32 {
@@ -312,7 +327,7 @@ impl Difference {
                 noise_mm: &self.search.noise.rows_mm,
                 taken: &taken,
                 wave_mm: self.wave_mm,
-                profile_step_mm: 0.0,
+                profile_step_mm: self.profile_step_mm,
             };
             measure(&stretch, region, options)
         });

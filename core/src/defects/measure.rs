@@ -31,6 +31,8 @@ const RING: f64 = 1.3;
 const RING_CELLS: f64 = 4.0;
 /// Cells that the smoothing adds to a round dent's area, in discs of its standard deviation; from raised cosines.
 const WIDENING: f64 = 5.0;
+/// Extents at half height within which the rim of any dent lies.
+const REACH: f64 = 1.2;
 /// Level down to which a region must hang together.
 const BODY_LEVEL: f32 = 0.2;
 /// Level down to which the volume is summed: below it lies the surroundings' own scatter.
@@ -118,15 +120,15 @@ pub(super) fn measure(stretch: &Stretch, region: &Region, options: &DefectOption
     let top = summit_mm(&relief, rough);
     // A wave beside it is no part of it, though the two touch.
     let whole = region;
-    let region = &Region { sign: region.sign, summit: region.summit, cells: connected(&relief, BODY_LEVEL * top) };
+    let region = &Region { sign: region.sign, summit: region.summit, cells: body(&relief, top) };
     let relief = Relief { stretch, region, columns, level: relief.level };
     let flank: Vec<(f32, f32)> =
         region.cells.iter().map(|c| (relief.height(*c), rise(stretch.smooth, *c).max(1e-6))).collect();
     // A cell that the level runs through counts by its part above it.
     let part = |(height, rise): &(f32, f32), level: f32| f64::from((0.5 + (height - level) / rise).clamp(0.0, 1.0));
     let parts_above = |height: f32| flank.iter().map(|cell| part(cell, height)).sum::<f64>();
-    let flat = parts_above(0.8 * top) > FLAT_SHARE * parts_above(LOWEST_LEVEL * top)
-        && region.cells.len() > LEAST_FLAT_CELLS;
+    let flat =
+        parts_above(0.8 * top) > FLAT_SHARE * parts_above(LOWEST_LEVEL * top) && region.cells.len() > LEAST_FLAT_CELLS;
     // A flat bottom is as deep as most of it: its summit is the worst of its noise.
     let depth = if flat { middle_mm(&relief, 0.5 * top).unwrap_or(top) } else { top };
     let cells_above = |level: f32| parts_above(level * depth);
@@ -135,7 +137,8 @@ pub(super) fn measure(stretch: &Stretch, region: &Region, options: &DefectOption
     let area_cells = if flat { cells_above(0.5) } else { area_cells(depth, noise_mm, &cells_above) };
     let body_level = if flat { 0.5 } else { EXTENT_LEVEL } * depth;
     let centre = centre(&relief, body_level);
-    let place = |column: f64, row: f64| (stretch.grid.x_mm(stretch.first_column as f64 + column), stretch.grid.y_mm(row));
+    let place =
+        |column: f64, row: f64| (stretch.grid.x_mm(stretch.first_column as f64 + column), stretch.grid.y_mm(row));
     let (x_mm, y_mm) = place(centre.0, centre.1);
     let summit = place((region.summit % columns) as f64, (region.summit / columns) as f64);
     let body: Vec<usize> = relief.above(body_level).collect();
@@ -151,7 +154,8 @@ pub(super) fn measure(stretch: &Stretch, region: &Region, options: &DefectOption
         let (x, y) = ((cell % columns) as f64 - centre.0, (cell / columns) as f64 - centre.1);
         2.0 * x.abs() * cell_mm <= length_mm && 2.0 * y.abs() * cell_mm <= width_mm
     };
-    let heights = whole.cells.iter().filter(|c| near(c)).map(|c| relief.height(*c)).filter(|h| *h > VOLUME_LEVEL * depth);
+    let heights =
+        whole.cells.iter().filter(|c| near(c)).map(|c| relief.height(*c)).filter(|h| *h > VOLUME_LEVEL * depth);
     let volume: f64 = heights.map(f64::from).sum();
     let signed = f64::from(region.sign * depth);
     Some(Defect {
@@ -241,7 +245,8 @@ fn summit_mm(relief: &Relief, rough: f32) -> f32 {
     for _ in 0..3 {
         let half: Vec<usize> = relief.above(0.5 * depth).collect();
         let disc = (half.len() as f64 / std::f64::consts::PI).sqrt();
-        let narrow = extents(half.into_iter(), relief.columns).map_or(disc, |across| 0.5 * across.0.min(across.1) as f64);
+        let narrow =
+            extents(half.into_iter(), relief.columns).map_or(disc, |across| 0.5 * across.0.min(across.1) as f64);
         let reach = (SUMMIT_SHARE * disc.min(narrow)).max(2.0);
         let near = relief.region.cells.iter().filter_map(|cell| {
             let (dx, dy) = relief.from_summit(*cell);
@@ -333,6 +338,22 @@ fn centre(relief: &Relief, level: f32) -> (f64, f64) {
         y += weight * (cell / relief.columns) as f64;
     }
     (x / sum, y / sum)
+}
+
+/// The cells that make a region's figures: what hangs together with the summit and lies no farther from the upper half's
+/// middle than its rim would.
+fn body(relief: &Relief, top: f32) -> Vec<usize> {
+    let upper = connected(relief, 0.5 * top);
+    let count = upper.len() as f64;
+    let (x, y) = upper.iter().map(|c| relief.from_summit(*c)).fold((0.0, 0.0), |sum, at| (sum.0 + at.0, sum.1 + at.1));
+    let Some((wide, high)) = extents(upper.into_iter(), relief.columns) else { return Vec::new() };
+    let (reach_x, reach_y) = (REACH * wide as f64 + 1.0, REACH * high as f64 + 1.0);
+    let mut cells = connected(relief, BODY_LEVEL * top);
+    cells.retain(|cell| {
+        let at = relief.from_summit(*cell);
+        (at.0 - x / count).abs() <= reach_x && (at.1 - y / count).abs() <= reach_y
+    });
+    cells
 }
 
 /// The cells above a level that hang together with the summit.

@@ -243,10 +243,7 @@ fn fit_cylinder(start: Reference, places: &[Place], free: bool) -> Option<Refere
 }
 
 /// A robust linear fit of z, and its scatter in mm.
-fn robust<const N: usize>(
-    places: &[Place],
-    row: impl Fn(&Place) -> SVector<f64, N>,
-) -> Option<(SVector<f64, N>, f64)> {
+fn robust<const N: usize>(places: &[Place], row: impl Fn(&Place) -> SVector<f64, N>) -> Option<(SVector<f64, N>, f64)> {
     if places.len() < 4 * N {
         return None;
     }

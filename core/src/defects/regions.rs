@@ -161,7 +161,8 @@ mod tests {
 
     #[test]
     fn two_that_touch_stay_two_and_a_noisy_one_stays_one() {
-        let found = find(&bumps(&[(20.0, 20.0, 9.0, 4.0), (36.0, 20.0, 9.0, 3.0), (60.0, 20.0, 6.0, -2.0)]), &[0.5; 40]);
+        let found =
+            find(&bumps(&[(20.0, 20.0, 9.0, 4.0), (36.0, 20.0, 9.0, 3.0), (60.0, 20.0, 6.0, -2.0)]), &[0.5; 40]);
         let mut heads: Vec<(f32, usize)> = found.iter().map(|r| (r.sign, r.summit % 80)).collect();
         heads.sort_by_key(|head| head.1);
         assert_eq!(heads.len(), 3, "{heads:?}");

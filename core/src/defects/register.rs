@@ -146,13 +146,15 @@ impl Pair<'_> {
             let x_mm = self.grid.x_mm((self.first + column) as f64) + dx_mm;
             ((x_mm - self.other.x0_mm) / self.other.cell_mm - self.columns.start as f64).round()
         };
-        let row_of = |row: usize| ((self.grid.y_mm(row as f64) + dy_mm - self.other.y0_mm) / self.other.cell_mm).round();
+        let row_of =
+            |row: usize| ((self.grid.y_mm(row as f64) + dy_mm - self.other.y0_mm) / self.other.cell_mm).round();
         let (mut n, mut sa, mut sb, mut saa, mut sbb, mut sab) = (0.0_f64, 0.0_f64, 0.0_f64, 0.0_f64, 0.0_f64, 0.0_f64);
         let mut all = 0.0_f64;
         for row in (0..self.window.rows).step_by(every) {
             let to = row_of(row);
             let inside = to >= 0.0 && to < self.scene.rows as f64;
-            let (mut rn, mut ra, mut rb, mut raa, mut rbb, mut rab) = (0.0_f32, 0.0_f32, 0.0_f32, 0.0_f32, 0.0_f32, 0.0_f32);
+            let (mut rn, mut ra, mut rb, mut raa, mut rbb, mut rab) =
+                (0.0_f32, 0.0_f32, 0.0_f32, 0.0_f32, 0.0_f32, 0.0_f32);
             for column in (0..self.window.columns).step_by(every) {
                 let a = self.window.values[row * self.window.columns + column];
                 if a.is_nan() {
@@ -219,7 +221,8 @@ impl Registration {
 
     /// The median offset, mm.
     pub(super) fn typical_mm(&self) -> (f64, f64) {
-        let middle = |pick: &dyn Fn(&(f64, f64, f64)) -> f64| median(self.knots.iter().map(pick).collect()).unwrap_or(0.0);
+        let middle =
+            |pick: &dyn Fn(&(f64, f64, f64)) -> f64| median(self.knots.iter().map(pick).collect()).unwrap_or(0.0);
         (middle(&|k| k.1), middle(&|k| k.2))
     }
 

@@ -171,7 +171,8 @@ fn places(task: &Task, depth: &Field) -> Vec<Place> {
     let coarse = depth.shrunk(COARSE, COARSE_SHARE);
     let middle = (COARSE - 1) as f64 / 2.0;
     let place = |(i, z): (usize, &f32)| {
-        let (column, row) = ((i % coarse.columns * COARSE) as f64 + middle, (i / coarse.columns * COARSE) as f64 + middle);
+        let (column, row) =
+            ((i % coarse.columns * COARSE) as f64 + middle, (i / coarse.columns * COARSE) as f64 + middle);
         Place {
             x_mm: task.grid.x_mm(task.columns.start as f64 + column),
             y_mm: task.grid.y_mm(row),
@@ -269,7 +270,8 @@ pub(super) fn bridge(smooth: &mut Field, widest: usize) {
 /// The core's columns of a field over the whole stretch.
 fn core_of(task: &Task, field: &Field) -> Field {
     let (from, columns) = (task.core.start - task.columns.start, task.core.len());
-    let values = field.values.chunks_exact(field.columns).flat_map(|line| &line[from..from + columns]).copied().collect();
+    let values =
+        field.values.chunks_exact(field.columns).flat_map(|line| &line[from..from + columns]).copied().collect();
     Field { columns, rows: field.rows, values }
 }
 

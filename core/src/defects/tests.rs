@@ -31,7 +31,9 @@ fn map(width_px: usize, base: impl Fn(f64, f64) -> f64, bumps: &[Bump], hole: im
 
 fn found(map: &mut GridMap) -> Findings {
     let recipe = Recipe::default();
-    find(map, &recipe.defects, Chainage { start_mm: 1000.0, falls: false }, 5.0, &mut |_| Ok(())).expect("find").expect("measured")
+    find(map, &recipe.defects, Chainage { start_mm: 1000.0, falls: false }, 5.0, &mut |_| Ok(()))
+        .expect("find")
+        .expect("measured")
 }
 
 fn wall(x: f64, y: f64) -> f64 {

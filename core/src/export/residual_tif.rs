@@ -104,7 +104,13 @@ impl ResidualFile {
             width_px: width as usize,
             height_px: height as usize,
         };
-        Ok(ResidualFile { path: path.to_path_buf(), decoder, geometry, side_px: side_px as usize, tiles: VecDeque::new() })
+        Ok(ResidualFile {
+            path: path.to_path_buf(),
+            decoder,
+            geometry,
+            side_px: side_px as usize,
+            tiles: VecDeque::new(),
+        })
     }
 
     fn tile(&mut self, number: u32) -> Result<&[f32]> {
@@ -153,7 +159,8 @@ impl MapReader for ResidualFile {
                 let (from, to) = (left.max(column_px), (left + tile_width).min(right));
                 for row in top.max(row_px)..(top + tile_height).min(bottom) {
                     let source = &tile[(row - top) * tile_width + from - left..][..to - from];
-                    window.depth_mm[(row - row_px) * width_px + from - column_px..][..to - from].copy_from_slice(source);
+                    window.depth_mm[(row - row_px) * width_px + from - column_px..][..to - from]
+                        .copy_from_slice(source);
                 }
             }
         }
@@ -174,8 +181,13 @@ mod tests {
         for first in [0, 400] {
             let some = if first == 0 { 400 } else { columns - 400 };
             let values: Vec<f32> = (0..rows * some).map(|i| value(first + i % some, i / some)).collect();
-            let strip =
-                ResidualStrip { origin_mm: (10.0, -5.0), cell_mm: 2.0, first_column: first, columns: some, values_mm: &values };
+            let strip = ResidualStrip {
+                origin_mm: (10.0, -5.0),
+                cell_mm: 2.0,
+                first_column: first,
+                columns: some,
+                values_mm: &values,
+            };
             writer.push(&strip).expect("push");
         }
         assert!(writer.finish().expect("write"));

@@ -19,12 +19,13 @@ use crate::export::manifest::{
 };
 use crate::export::npy::NpyWriter;
 use crate::export::preview::{self, Picture, PreviewText};
+use crate::export::report::{self, ReportRun};
+use crate::export::residual_tif::{self, ResidualWriter};
 use crate::export::tiles::{TileGrid, TileWriter};
 use crate::export::trajectory_csv::{TrajectoryRow, TrajectoryWriter};
-use crate::export::residual_tif::{self, ResidualWriter};
 use crate::export::{defect_list, depth_png, depth_tif, sections_csv, texture};
 use crate::motion::track::TrackUse;
-use crate::recipe::DefectOptions;
+use crate::recipe::{DefectOptions, Method};
 use crate::recording::{FrameSteps, RecordedRun, Recorder, Segment};
 use crate::rig::{LineDirection, Rig};
 use crate::source::{self, SourceInfo, encoded_frames};
@@ -286,8 +287,8 @@ impl<'a> Products<'a> {
         let profile_step_mm = resolution.and_then(|r| r.r_lateral_mm).unwrap_or(0.0);
         let Maps { gray, picture, found } =
             timings.time("maps", || self.write_maps(finished.as_mut(), profile_step_mm, progress))?;
-        if let Some((_, time)) = found {
-            timings.add("defects", time);
+        if let Some((_, time)) = &found {
+            timings.add("defects", *time);
         }
         if let Some(trajectory) = self.trajectory.take() {
             progress.step("trajectory")?;
@@ -319,6 +320,10 @@ impl<'a> Products<'a> {
             timings_s: std::collections::BTreeMap::new(),
             products: Vec::new(),
         };
+        if let (Some((findings, _)), Some(map), true) = (&found, &mut finished, self.wants(ProductGroup::Report)) {
+            progress.step("report")?;
+            timings.time("report", || self.write_report(findings, map, &manifest, progress.warnings()))?;
+        }
         let archived = timings.time("archive", || self.finish_archive(&manifest, finished.as_mut(), progress))?;
         timings.time("recording", || self.finish_recording(picture, progress))?;
         if let Some(warning) = archived {
@@ -332,6 +337,34 @@ impl<'a> Products<'a> {
         manifest.timings_s = timings.stages;
         manifest.write(&request.out_dir)?;
         Ok(manifest)
+    }
+
+    fn wants(&self, group: ProductGroup) -> bool {
+        self.request.products.contains(&group)
+    }
+
+    fn write_report(
+        &self,
+        findings: &Findings,
+        map: &mut FinishedMap<'_>,
+        manifest: &Manifest,
+        warnings: &[String],
+    ) -> Result<()> {
+        let request = self.request;
+        let run = ReportRun {
+            asset: &request.asset,
+            source: &request.source_name,
+            recorded_at: request.recorded_at,
+            rig: &request.rig.name,
+            method: match request.recipe.method {
+                Method::Metric => "metric",
+                Method::Paper => "paper",
+            },
+            quality: &manifest.quality,
+            resolution: manifest.resolution.as_ref(),
+            warnings,
+        };
+        report::write(&run, findings, map, &request.out_dir)
     }
 
     /// Writes the maps, two at a time: both halves squeeze the whole map, each on its own core. Meanwhile the defects
@@ -350,8 +383,9 @@ impl<'a> Products<'a> {
         let (options, chainage) = (&self.request.recipe.defects, self.request.chainage);
         let shared = SharedMap::new(map);
         std::thread::scope(|scope| {
-            let searching = wants(ProductGroup::Defects)
-                .then(|| scope.spawn(|| find_defects(&mut shared.reader(), options, chainage, profile_step_mm, folder)));
+            let searching = (wants(ProductGroup::Defects) || wants(ProductGroup::Report)).then(|| {
+                scope.spawn(|| find_defects(&mut shared.reader(), options, chainage, profile_step_mm, folder))
+            });
             let beside = scope.spawn(|| -> Result<Option<Picture>> {
                 if wants(ProductGroup::Depth) {
                     depth_tif::write(&mut shared.reader(), &folder.join("depth.tif"))?;

@@ -184,13 +184,22 @@ impl Wall {
         all
     }
 
-    /// What became of the wall some time later: the first dent past `x_mm` is 2 mm deeper, and beyond it there is a new
+    /// What became of the wall some time later: the first large dent past `x_mm` is 2 mm deeper, and beyond it there is a new
     /// one, 4 mm deep and 30 mm in radius, clear of the others.
     pub fn age(&mut self, x_mm: f64) {
         let bumps = self.bumps_between(x_mm, x_mm + 1500.0);
-        let deeper = bumps.iter().filter(|b| b.height > 2.0 && b.x - b.r > x_mm).min_by(|a, b| a.x.total_cmp(&b.x)).copied();
+        let deeper = bumps
+            .iter()
+            .filter(|b| b.height > 2.0 && b.r > 30.0 && b.x - b.r > x_mm)
+            .min_by(|a, b| a.x.total_cmp(&b.x))
+            .copied();
         self.placed.extend(deeper.map(|dent| Bump { height: 2.0, ..dent }));
-        let new = |i: u32| Bump { x: x_mm + 60.0 + 15.0 * f64::from(i / 8), y: 35.0 * f64::from(i % 8) - 122.5, r: 30.0, height: 4.0 };
+        let new = |i: u32| Bump {
+            x: x_mm + 60.0 + 15.0 * f64::from(i / 8),
+            y: 35.0 * f64::from(i % 8) - 122.5,
+            r: 30.0,
+            height: 4.0,
+        };
         let clear = |new: &Bump| bumps.iter().all(|b| (b.x - new.x).hypot(b.y - new.y) > b.r + new.r + 15.0);
         self.placed.extend((0..400).map(new).find(clear));
     }
@@ -399,7 +408,8 @@ mod tests {
 
     #[test]
     fn an_oval_pipe_is_wider_along_the_view() {
-        let pipe = Wall { shape: Shape::Pipe { radius_mm: 300.0 }, ovality: 0.01, bumps: None, waves_mm: 0.0, ..bumpy() };
+        let pipe =
+            Wall { shape: Shape::Pipe { radius_mm: 300.0 }, ovality: 0.01, bumps: None, waves_mm: 0.0, ..bumpy() };
         let (z, y) = (pipe.base_z_mm(200.0) - pipe.distance_mm - 301.5, 200.0 / 298.5);
         assert!(((z / 301.5).powi(2) + y * y - 1.0).abs() < 1e-9);
     }
@@ -410,7 +420,8 @@ mod tests {
         later.age(300.0);
         let (before, after) = (bumpy().bumps_between(0.0, 3000.0), later.bumps_between(0.0, 3000.0));
         assert_eq!(after.len(), before.len() + 1);
-        let grown: Vec<f64> = before.iter().zip(&after).map(|(a, b)| b.height - a.height).filter(|h| *h != 0.0).collect();
+        let grown: Vec<f64> =
+            before.iter().zip(&after).map(|(a, b)| b.height - a.height).filter(|h| *h != 0.0).collect();
         assert_eq!(grown.len(), 1);
         assert!((grown[0] - 2.0).abs() < 1e-12);
     }

@@ -62,6 +62,9 @@ pub(super) struct Process {
     /// When the run was recorded (RFC 3339); when nothing is said, the time of the file
     #[arg(long, value_name = "TIME")]
     recorded_at: Option<jiff::Timestamp>,
+    /// The name of the asset, for the report
+    #[arg(long, value_name = "NAME", default_value = "", hide_default_value = true)]
+    asset: String,
     /// Chainage of the run's first frame, mm
     #[arg(long, value_name = "MM", default_value_t = 0.0, allow_negative_numbers = true)]
     chainage_mm: f64,
@@ -138,6 +141,7 @@ impl Process {
             source_name: self.name.clone().or(name).unwrap_or_else(|| self.source.display().to_string()),
             fps: self.fps,
             recorded_at: self.recorded_at.unwrap_or_else(|| time_of(&self.source)),
+            asset: self.asset.clone(),
             chainage: Chainage { start_mm: self.chainage_mm, falls: self.direction == "backward" },
             rig,
             recipe,

@@ -164,7 +164,8 @@ fn doubt(piece: &mut [Spot], smooth: &[(f32, f32)]) {
 /// its depth on the stiff one.
 fn as_smooth_as_true(stiff: &[(f32, f32)], supple: &[(f32, f32)]) -> Vec<(f32, f32)> {
     // The stiff line's error is part of the supple one's: their difference has the difference of the variances.
-    let chance = |(a, b): (&(f32, f32), &(f32, f32))| (b.0 - a.0).powi(2) / (ALIKE_APART * ALIKE_APART * (b.1 - a.1).max(1e-8));
+    let chance =
+        |(a, b): (&(f32, f32), &(f32, f32))| (b.0 - a.0).powi(2) / (ALIKE_APART * ALIKE_APART * (b.1 - a.1).max(1e-8));
     let mut sums = vec![0.0; stiff.len() + 1];
     for (i, pair) in stiff.iter().zip(supple).enumerate() {
         sums[i + 1] = sums[i] + chance(pair).min(100.0);
