@@ -1,7 +1,7 @@
 //! Depth map → defects: what departs from the undamaged shape, with how sure that is and what could not have been seen.
 //!
 //! The map is examined in stretches with margins, in cells of a millimetre or two; the memory does not depend on the
-//! run's length. In each stretch a plane or a cylinder along the travel is fitted ([`Shape`](reference::Shape), chosen
+//! run's length. In each stretch a plane or a cylinder along the travel is fitted (chosen by evidence
 //! for the whole run), then a background that follows slow waves and the poses' drift but leaves the defects out; what
 //! is left is the *residual*. Its regions that rise above `max(defects.depth_min_mm, defects.noise_factor · σ)` are
 //! defects; σ is the residual's own scatter beside them, row by row.

@@ -262,6 +262,9 @@ recipe! {
         /// Clock position that the camera looks at on a pipe, seen along the rising chainage; 0 takes the camera to look
         /// level: at 9 o'clock from inside, at 3 o'clock from outside.
         view_clock_h: f64 = 0.0, "h", number(0.0, 12.0);
+        /// A pipe's radius as built; 0 where it is not known. With it, the ovality is told from the arc that is seen to a few
+        /// hundredths of a per cent; without it, only from how the arc departs from a circle.
+        nominal_radius_mm: f64 = 0.0, "mm", number(0.0, 1000000.0);
         /// Length of the stretch that one row of sections.csv measures.
         section_step_mm: f64 = 100.0, "mm", number(10.0, 100000.0);
         /// Most defects that are listed, the deepest first; what is left out is counted.

@@ -116,10 +116,9 @@ fn laplacian(x: &[f32], columns: usize, out: &mut [f32]) {
         let above = &x[row.saturating_sub(1) * columns..][..columns];
         let below = &x[(row + 1).min(rows - 1) * columns..][..columns];
         let out = &mut out[row * columns..(row + 1) * columns];
-        for column in 0..columns {
-            let left = line[column.saturating_sub(1)];
-            let right = line[(column + 1).min(columns - 1)];
-            out[column] = left + right + above[column] + below[column] - 4.0 * line[column];
+        let beside = |column: usize| line[column.saturating_sub(1)] + line[(column + 1).min(columns - 1)];
+        for (column, (out, (above, below))) in out.iter_mut().zip(above.iter().zip(below)).enumerate() {
+            *out = beside(column) + above + below - 4.0 * line[column];
         }
     }
 }

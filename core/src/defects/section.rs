@@ -27,6 +27,8 @@ pub(super) struct Station<'a> {
     pub reference: &'a Reference,
     /// Cells to a side of a coarse cell.
     pub factor: usize,
+    /// A pipe's radius as built, mm; 0 where it is not known.
+    pub nominal_radius_mm: f64,
 }
 
 impl Station<'_> {
@@ -118,7 +120,8 @@ impl Station<'_> {
         row.radius_mm = Some(radius_mm);
         row.diameter_mm = Some(2.0 * radius_mm);
         let seen: Vec<(f64, f64)> = undamaged.iter().map(polar).collect();
-        if let Some((ovality, sd, mean_mm)) = ovality(&seen, radius_mm, 4.0 * circle.scatter_mm) {
+        if let Some((ovality, sd, mean_mm)) = ovality(&seen, radius_mm, self.nominal_radius_mm, 4.0 * circle.scatter_mm)
+        {
             row.mean_radius_mm = Some(mean_mm);
             row.ovality_percent = Some(ovality);
             row.ovality_sd_percent = Some(sd);
@@ -132,9 +135,12 @@ impl Station<'_> {
 
 /// Ovality in per cent, (largest − smallest diameter) / mean, with its standard deviation, and the mean radius in mm: r(θ) = r₀ + a·cos θ + b·sin θ +
 /// c·cos 2θ, 2·c/r₀: above 0 where the section is longest along the view. The view's axis is taken to be one of the
-/// ellipse's. Places are (θ, r).
-fn ovality(places: &[(f64, f64)], radius_mm: f64, reach_mm: f64) -> Option<(f64, f64, f64)> {
-    let mut solution = SVector::<f64, 4>::from([radius_mm, 0.0, 0.0, 0.0]);
+/// ellipse's. r₀ is the radius as built where that is known (above 0). Places are (θ, r).
+fn ovality(places: &[(f64, f64)], radius_mm: f64, nominal_mm: f64, reach_mm: f64) -> Option<(f64, f64, f64)> {
+    let known = nominal_mm > 0.0;
+    let start_mm = if known { nominal_mm } else { radius_mm };
+    let mut solution = SVector::<f64, 4>::from([start_mm, 0.0, 0.0, 0.0]);
+    let mut reach_mm = reach_mm.max(0.2) + (start_mm - radius_mm).abs();
     let row = |theta: f64| SVector::<f64, 4>::from([1.0, theta.cos(), theta.sin(), (2.0 * theta).cos()]);
     let mut sd = f64::INFINITY;
     for _ in 0..6 {
@@ -144,7 +150,7 @@ fn ovality(places: &[(f64, f64)], radius_mm: f64, reach_mm: f64) -> Option<(f64,
         for (theta, r) in places {
             let row = row(*theta);
             let off = r - row.dot(&solution);
-            if off.abs() < reach_mm.max(0.2) {
+            if off.abs() < reach_mm {
                 normal += row * row.transpose();
                 right += off * row;
                 squares += off * off;
@@ -154,8 +160,13 @@ fn ovality(places: &[(f64, f64)], radius_mm: f64, reach_mm: f64) -> Option<(f64,
         if count < 20.0 {
             return None;
         }
+        if known {
+            // A known radius does not move.
+            normal[(0, 0)] += 1e9 * count;
+        }
         let inverse = normal.try_inverse()?;
         solution += inverse * right;
+        reach_mm = 0.2_f64.max(4.0 * (squares / count).sqrt());
         sd = (squares / count * inverse[(3, 3)]).sqrt() * ALIKE;
     }
     let mean_mm = solution[0];
@@ -183,7 +194,11 @@ mod tests {
                 (theta, 300.0 + 2.0 * theta.cos() + 1.5 * (2.0 * theta).cos() + noise)
             })
             .collect();
-        let (percent, sd, _) = ovality(&places, 300.0, 5.0).expect("a fit");
+        let (percent, sd, _) = ovality(&places, 300.0, 0.0, 5.0).expect("a fit");
         assert!((percent - 1.0).abs() < 0.2 && sd < 0.5, "{percent} ± {sd}");
+        // A quarter of the arc is enough where the radius is known.
+        let few: Vec<(f64, f64)> = places.into_iter().filter(|place| place.0.abs() < 0.5).collect();
+        let (percent, sd, mean_mm) = ovality(&few, 296.0, 300.0, 5.0).expect("a fit");
+        assert!((percent - 1.0).abs() < 0.03 && sd < 0.05 && mean_mm == 300.0, "{percent} ± {sd}");
     }
 }

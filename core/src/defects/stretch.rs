@@ -312,6 +312,7 @@ fn sections(
                 free,
                 reference,
                 factor: COARSE / 2,
+                nominal_radius_mm: task.options.nominal_radius_mm,
             };
             station.measure()
         })
