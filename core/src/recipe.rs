@@ -246,7 +246,7 @@ recipe! {
         depth_min_mm: f64 = 0.5, "mm", number(0.01, 10000.0);
         /// Least depth as a multiple of the surface's own scatter beside the defects. Less finds fainter defects, and more
         /// that are none.
-        noise_factor: f64 = 5.0, "σ", number(2.0, 100.0);
+        noise_factor: f64 = 6.0, "σ", number(2.0, 100.0);
         /// Regions that cover less than half of a disc of this radius are not listed.
         radius_min_mm: f64 = 4.0, "mm", number(0.0, 10000.0);
         /// Waves longer than this belong to the undamaged surface; 0 takes a quarter of the map's height, 60 to 400 mm.

@@ -25,8 +25,6 @@ pub const SCHEMA_VERSION: u32 = 1;
 
 /// Columns of cells that are compared at once.
 const CORE_COLUMNS: usize = 2048;
-/// How much farther than a defect a change must rise above the scatter: two runs err, and nothing shall be claimed lightly.
-const STRICTER: f64 = 1.15;
 /// Smoothing of the difference before the search, cells: what two runs do not share is mostly fine.
 const CHANGE_SMOOTHING_CELLS: f32 = 1.8;
 /// Standard deviations of the level of detection: 95 % of what does not change stays below.
@@ -250,8 +248,7 @@ impl Search {
         let mut even = smooth.clone();
         even.values.iter_mut().zip(&slack).for_each(|(v, s)| *v /= s);
         let noise = Noise::of(&even, &free, masked.is_some());
-        let threshold =
-            |sigma: &f32| ((STRICTER * options.noise_factor) as f32 * sigma).max(options.depth_min_mm as f32);
+        let threshold = |sigma: &f32| (options.noise_factor as f32 * sigma).max(options.depth_min_mm as f32);
         let thresholds_mm: Vec<f32> = noise.rows_mm.iter().map(threshold).collect();
         let regions = regions::find(&even, &thresholds_mm);
         Search { off, smooth, slack, noise, thresholds_mm, regions }
