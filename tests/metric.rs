@@ -5,6 +5,7 @@
 use std::ops::ControlFlow;
 use std::path::Path;
 
+use stria_core::defects::Chainage;
 use stria_core::export::{cloud_ply, manifest::Manifest, npy, trajectory_csv};
 use stria_core::geometry::WorldFromCamera;
 use stria_core::pipeline::{ProductGroup, Request, process};
@@ -50,6 +51,8 @@ fn measure(scene: Scene, seconds: f64, fps: f64, seed: u64, laser_on: impl Fn(u3
         fps: None,
         poses: None,
         recorded_at: jiff::Timestamp::UNIX_EPOCH,
+        asset: String::new(),
+        chainage: Chainage::default(),
         rig: simulation.rig().clone(),
         recipe,
         out_dir: out_dir.clone(),

@@ -4,6 +4,7 @@ use std::ops::ControlFlow;
 use std::path::{Path, PathBuf};
 use std::process::Command;
 
+use stria_core::defects::Chainage;
 use stria_core::export::manifest::Manifest;
 use stria_core::pipeline::{ProductGroup, Request, process};
 use stria_core::recipe::Recipe;
@@ -34,6 +35,8 @@ fn process_source(source: &Path, rig: &Rig) -> Result<Manifest> {
         source_name: source.file_name().expect("a name").to_string_lossy().into_owned(),
         fps: None,
         recorded_at: jiff::Timestamp::UNIX_EPOCH,
+        asset: String::new(),
+        chainage: Chainage::default(),
         rig: rig.clone(),
         recipe: Recipe::load("paper").expect("built in"),
         poses: None,

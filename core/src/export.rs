@@ -6,10 +6,12 @@
 
 pub mod archive_mcap;
 pub(crate) mod canvas;
+pub mod change_list;
 pub mod cloud_e57;
 pub mod cloud_laz;
 pub mod cloud_pcd;
 pub mod cloud_ply;
+pub mod defect_list;
 pub mod depth_png;
 pub mod depth_tif;
 pub mod live_frame;
@@ -20,7 +22,10 @@ pub mod npy;
 pub mod parts;
 pub mod preview;
 mod pyramid;
+pub mod report;
+pub mod residual_tif;
 pub mod section_csv;
+pub mod sections_csv;
 pub mod texture;
 pub mod tiles;
 pub mod trajectory_csv;

@@ -4,7 +4,7 @@
 //!
 //! ```text
 //! source ▶ Frame ▶ stripe ▶ Stripe ▶ triangulation ▶ Profile ─┐
-//!             └──▶ motion ▶ Shift ▶ Pose ─────────────────────┴▶ surface ▶ depth map + texture ▶ export
+//!             └──▶ motion ▶ Shift ▶ Pose ─────────────────────┴▶ surface ▶ depth map + texture ▶ defects ▶ export
 //! ```
 //!
 //! Frames stream: every buffer has a bound, and the finished map waits in tiles on disk.
@@ -19,6 +19,7 @@
 //! line implies: along the image's x for a vertical line, along its y for a horizontal one.
 
 pub mod calibration;
+pub mod defects;
 pub mod depth_map;
 pub mod error;
 pub mod export;

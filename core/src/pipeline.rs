@@ -21,6 +21,7 @@ use std::time::{Duration, Instant};
 use nalgebra::Point3;
 use serde::{Deserialize, Serialize};
 
+use crate::defects::Chainage;
 use crate::depth_map::sheet::WallColours;
 use crate::depth_map::strips::TextureStrip;
 use crate::error::{Error, Result};
@@ -54,21 +55,27 @@ pub enum ProductGroup {
     Trajectory,
     /// `recording.rrd`.
     Recording,
+    /// `defects.json`, `defects.csv`, `sections.csv`, `residual.tif`.
+    Defects,
     /// `archive.mcap`.
     Archive,
+    /// `report.html`, and what it rests on: the files of [`ProductGroup::Defects`].
+    Report,
 }
 
 impl ProductGroup {
     /// All groups.
-    pub const ALL: [ProductGroup; 8] = [
+    pub const ALL: [ProductGroup; 10] = [
         ProductGroup::Depth,
         ProductGroup::Texture,
         ProductGroup::Preview,
         ProductGroup::Tiles,
         ProductGroup::Cloud,
         ProductGroup::Trajectory,
+        ProductGroup::Defects,
         ProductGroup::Recording,
         ProductGroup::Archive,
+        ProductGroup::Report,
     ];
 }
 
@@ -84,6 +91,10 @@ pub struct Request {
     pub fps: Option<f64>,
     /// When the run's first frame was captured: the archive's and the recording's times count from it.
     pub recorded_at: jiff::Timestamp,
+    /// The name of the asset, for the report; empty where nobody said.
+    pub asset: String,
+    /// Where the run lies on its asset.
+    pub chainage: Chainage,
     /// The rig it was recorded with.
     pub rig: Rig,
     /// How to process it.

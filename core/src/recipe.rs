@@ -240,6 +240,36 @@ recipe! {
         /// Frames after which changed tiles are written while the run goes on.
         tile_frames: u32 = 60, "frames", whole(1, 100000);
     }
+    /// What is listed as a defect.
+    defects: DefectOptions {
+        /// Least depth or height that is listed, whatever the noise.
+        depth_min_mm: f64 = 0.5, "mm", number(0.01, 10000.0);
+        /// Least depth as a multiple of the surface's own scatter beside the defects. Less finds fainter defects, and more
+        /// that are none.
+        noise_factor: f64 = 6.0, "σ", number(2.0, 100.0);
+        /// Regions that cover less than half of a disc of this radius are not listed.
+        radius_min_mm: f64 = 4.0, "mm", number(0.0, 10000.0);
+        /// Waves longer than this belong to the undamaged surface; 0 takes a quarter of the map's height, 60 to 400 mm.
+        wave_mm: f64 = 0.0, "mm", number(0.0, 100000.0);
+        /// Size of the cells that are searched; 0 takes 1 mm at 425 mm of distance, and in proportion.
+        cell_mm: f64 = 0.0, "mm", number(0.0, 1000.0);
+        /// A flat-bottomed place with steep sides is a hole from this depth on, and missing material above it.
+        hole_depth_mm: f64 = 15.0, "mm", number(0.1, 10000.0);
+        /// Depth or height from which a defect's severity is moderate.
+        moderate_mm: f64 = 3.0, "mm", number(0.0, 10000.0);
+        /// Depth or height from which a defect's severity is severe.
+        severe_mm: f64 = 10.0, "mm", number(0.0, 10000.0);
+        /// Clock position that the camera looks at on a pipe, seen along the rising chainage; 0 takes the camera to look
+        /// level: at 9 o'clock from inside, at 3 o'clock from outside.
+        view_clock_h: f64 = 0.0, "h", number(0.0, 12.0);
+        /// A pipe's radius as built; 0 where it is not known. With it, the ovality is told from the arc that is seen to a few
+        /// hundredths of a per cent; without it, only from how the arc departs from a circle.
+        nominal_radius_mm: f64 = 0.0, "mm", number(0.0, 1000000.0);
+        /// Length of the stretch that one row of sections.csv measures.
+        section_step_mm: f64 = 100.0, "mm", number(10.0, 100000.0);
+        /// Most defects that are listed, the deepest first; what is left out is counted.
+        list_max: u32 = 2000, "", whole(1, 100000);
+    }
     /// The rerun recording.
     recording: RecordingOptions {
         /// Largest size of the recording: past it, images and points become sparser, never the plots.
@@ -307,6 +337,14 @@ impl Recipe {
     /// The whole recipe as TOML that [`Recipe::from_toml`] reads back.
     pub fn to_toml(&self) -> String {
         toml::to_string(self).unwrap_or_else(|e| unreachable!("a recipe is plain tables and numbers: {e}"))
+    }
+
+    /// Changes one value given as `key=value`.
+    pub fn set_pair(&mut self, pair: &str) -> Result<()> {
+        let Some((key, value)) = pair.split_once('=') else {
+            return Err(Error::input(format!("--set {pair}"), "no '='", "key=value, such as stripe.k=0.8"));
+        };
+        self.set(key.trim(), value.trim())
     }
 
     /// Changes one value, as `--set key=value` does.

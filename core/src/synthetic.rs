@@ -29,7 +29,7 @@ pub use encode::{Quality, VideoWriter};
 pub use motion::Motion;
 pub use scene::{Ambient, LaserLight, LineProfile, Material, SCENES, Scene, SensorNoise, TextureReach};
 pub use truth::FrameTruth;
-pub use wall::{Bump, Bumps, Shape, StepRow, Wall};
+pub use wall::{Block, Bump, Bumps, Shape, StepRow, Wall};
 pub use write::{Output, write_png, write_run};
 
 use nalgebra::Vector3;
@@ -44,6 +44,9 @@ pub const MAX_SECONDS: f64 = 3600.0;
 
 /// The most frames a second.
 pub const MAX_FPS: f64 = 240.0;
+
+/// Where a wall that is shown some time later has aged: beyond what the laser meets first, mm.
+const AGES_FROM_MM: f64 = 200.0;
 
 /// The most pixels of an image: 8K.
 const MAX_PIXELS: u64 = 8192 * 4320;
@@ -85,7 +88,10 @@ impl Simulation {
             return Err(Error::input("fps", format!("{fps} frames/s"), format!("0.1 to {MAX_FPS} frames/s")));
         }
         let frames = ((seconds * fps).round() as u32).max(1);
-        scene.wall.seed = seed;
+        scene.wall.seed = scene.wall_seed.unwrap_or(seed);
+        if scene.later {
+            scene.wall.age(AGES_FROM_MM);
+        }
         let base_roll_rad = match rig.laser.line {
             LineDirection::Vertical => 0.0,
             LineDirection::Horizontal => -std::f64::consts::FRAC_PI_2,

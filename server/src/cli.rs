@@ -1,8 +1,8 @@
 //! The command line: one file per command. A command returns its exit code; errors are said here, once.
 
 mod backup;
-mod bearer;
 mod calibrate;
+mod compare;
 mod engine;
 mod export;
 mod inspect;
@@ -31,6 +31,7 @@ struct Cli {
 #[derive(Subcommand)]
 enum Command {
     Process(process::Process),
+    Compare(compare::Compare),
     Simulate(simulate::SimulateArgs),
     Calibrate(calibrate::Calibrate),
     Serve(serve::Serve),
@@ -84,6 +85,7 @@ pub fn run() -> ExitCode {
     let cli = Cli::parse();
     let outcome = match cli.command {
         Command::Process(command) => command.run(),
+        Command::Compare(command) => command.run(),
         Command::Simulate(args) => simulate::run(&args).map(|()| Success::Done),
         Command::Calibrate(command) => command.run(),
         Command::Serve(command) => command.run(),

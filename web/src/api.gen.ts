@@ -182,7 +182,10 @@ export interface paths {
             path?: never;
             cookie?: never;
         };
-        /** The job's MCAP archive: the product `archive.mcap`. */
+        /**
+         * The job's MCAP archive. Without parameters it is the product `archive.mcap`, with ranges and an ETag; with any, the
+         *     part that they name is made while it is sent.
+         */
         get: operations["get_archive"];
         put?: never;
         post?: never;
@@ -2335,7 +2338,16 @@ export interface operations {
     };
     get_archive: {
         parameters: {
-            query?: never;
+            query?: {
+                /** @description `false`: without the camera's frames. */
+                frames?: boolean;
+                /** @description Only every n-th frame with what was measured in it, and every n-th point of the surface. */
+                every?: number;
+                /** @description Only the wall from this chainage on, mm. */
+                from_mm?: number;
+                /** @description Only the wall up to this chainage, mm. */
+                to_mm?: number;
+            };
             header?: never;
             path: {
                 /** @description The job */
@@ -2366,6 +2378,14 @@ export interface operations {
                     [name: string]: unknown;
                 };
                 content?: never;
+            };
+            400: {
+                headers: {
+                    [name: string]: unknown;
+                };
+                content: {
+                    "application/problem+json": components["schemas"]["Problem"];
+                };
             };
             /** @description Nobody that this server knows */
             401: {
@@ -2410,7 +2430,6 @@ export interface operations {
                     "application/problem+json": components["schemas"]["Problem"];
                 };
             };
-            /** @description The records or files do not answer, or all places are taken; come back in a moment */
             503: {
                 headers: {
                     [name: string]: unknown;
@@ -5507,6 +5526,14 @@ export interface operations {
                     "application/problem+json": components["schemas"]["Problem"];
                 };
             };
+            423: {
+                headers: {
+                    [name: string]: unknown;
+                };
+                content: {
+                    "application/problem+json": components["schemas"]["Problem"];
+                };
+            };
             /** @description Too many requests; `Retry-After` says when to come back */
             429: {
                 headers: {
@@ -5651,6 +5678,12 @@ export interface operations {
                     "application/problem+json": components["schemas"]["Problem"];
                 };
             };
+            460: {
+                headers: {
+                    [name: string]: unknown;
+                };
+                content?: never;
+            };
             /** @description The records or files do not answer, or all places are taken; come back in a moment */
             503: {
                 headers: {
@@ -5728,14 +5761,6 @@ export interface operations {
                     "application/problem+json": components["schemas"]["Problem"];
                 };
             };
-            408: {
-                headers: {
-                    [name: string]: unknown;
-                };
-                content: {
-                    "application/problem+json": components["schemas"]["Problem"];
-                };
-            };
             409: {
                 headers: {
                     [name: string]: unknown;
@@ -5793,7 +5818,6 @@ export interface operations {
                     "application/problem+json": components["schemas"]["Problem"];
                 };
             };
-            /** @description The records or files do not answer, or all places are taken; come back in a moment */
             503: {
                 headers: {
                     [name: string]: unknown;

@@ -1,12 +1,14 @@
 //! The products of a job: what is written while the frames go by, and what is written at the end.
 
 use std::path::Path;
+use std::time::{Duration, Instant};
 
 use super::archiving::ArchivedJob;
 use super::laz::LazThread;
 use super::progress::Progress;
 use super::quality::QualityCounter;
 use super::{Cargo, Colours, Event, Newest, ProductGroup, Request, Timings};
+use crate::defects::{self, Chainage, Findings};
 use crate::depth_map::sheet::Sheet;
 use crate::depth_map::strips::{add_strip, strip_grid};
 use crate::depth_map::{FinishedMap, Grid, MapReader, SharedMap, SurfaceMap};
@@ -19,10 +21,13 @@ use crate::export::manifest::{
 };
 use crate::export::npy::NpyWriter;
 use crate::export::preview::{self, Picture, PreviewText};
+use crate::export::report::{self, ReportRun};
+use crate::export::residual_tif::{self, ResidualWriter};
 use crate::export::tiles::{TileGrid, TileWriter};
 use crate::export::trajectory_csv::{TrajectoryRow, TrajectoryWriter};
-use crate::export::{depth_png, depth_tif, texture};
+use crate::export::{defect_list, depth_png, depth_tif, sections_csv, texture};
 use crate::motion::track::TrackUse;
+use crate::recipe::{DefectOptions, Method};
 use crate::recording::{FrameSteps, RecordedRun, Recordings, Segment};
 use crate::rig::{LineDirection, Rig};
 use crate::source::{self, Beside, SourceInfo};
@@ -121,14 +126,17 @@ impl<'a> Products<'a> {
     /// Whether any product shows the wall's colours.
     pub(super) fn wants_colours(&self) -> bool {
         // The depth maps alone, the trajectory and the stripes have none.
-        let coloured = |group: &ProductGroup| !matches!(group, ProductGroup::Depth | ProductGroup::Trajectory);
+        let coloured = |group: &ProductGroup| {
+            !matches!(group, ProductGroup::Depth | ProductGroup::Trajectory | ProductGroup::Defects)
+        };
         self.request.products.iter().any(coloured)
     }
 
     /// Whether any product shows the wall's colours between the profiles too.
     pub(super) fn wants_wall_colours(&self) -> bool {
         let shows = |group: &ProductGroup| {
-            !matches!(group, ProductGroup::Depth | ProductGroup::Trajectory | ProductGroup::Cloud)
+            use ProductGroup::{Cloud, Defects, Depth, Trajectory};
+            !matches!(group, Depth | Trajectory | Cloud | Defects)
         };
         self.request.products.iter().any(shows)
     }
@@ -286,7 +294,12 @@ impl<'a> Products<'a> {
         let (quality, gaps, resolution) = quality.finish(&request.rig, coverage);
         let given = request.track_use(self.beside);
         warn_of_quality(&quality, &gaps, request, given, progress)?;
-        let (gray, picture) = timings.time("maps", || self.write_maps(finished.as_mut(), progress))?;
+        let profile_step_mm = resolution.and_then(|r| r.r_lateral_mm).unwrap_or(0.0);
+        let Maps { gray, picture, found } =
+            timings.time("maps", || self.write_maps(finished.as_mut(), profile_step_mm, progress))?;
+        if let Some((_, time)) = &found {
+            timings.add("defects", *time);
+        }
         if let Some(trajectory) = self.trajectory.take() {
             progress.step("trajectory")?;
             trajectory.finish()?;
@@ -321,6 +334,10 @@ impl<'a> Products<'a> {
             timings_s: std::collections::BTreeMap::new(),
             products: Vec::new(),
         };
+        if let (Some((findings, _)), Some(map), true) = (&found, &mut finished, self.wants(ProductGroup::Report)) {
+            progress.step("report")?;
+            timings.time("report", || self.write_report(findings, map, &manifest, progress.warnings()))?;
+        }
         let archived = timings.time("archive", || self.finish_archive(&manifest, finished.as_mut(), progress))?;
         manifest.recordings = timings.time("recording", || self.finish_recording(picture, progress))?;
         if let Some(warning) = archived {
@@ -336,20 +353,53 @@ impl<'a> Products<'a> {
         Ok(manifest)
     }
 
-    /// Writes the maps, two at a time: both halves squeeze the whole map, each on its own core. Returns the gray values
-    /// of `depth.png`, and the picture for people.
+    fn wants(&self, group: ProductGroup) -> bool {
+        self.request.products.contains(&group)
+    }
+
+    fn write_report(
+        &self,
+        findings: &Findings,
+        map: &mut FinishedMap<'_>,
+        manifest: &Manifest,
+        warnings: &[String],
+    ) -> Result<()> {
+        let request = self.request;
+        let run = ReportRun {
+            asset: &request.asset,
+            source: &request.source_name,
+            recorded_at: request.recorded_at,
+            rig: &request.rig.name,
+            method: match request.recipe.method {
+                Method::Metric => "metric",
+                Method::Paper => "paper",
+            },
+            quality: &manifest.quality,
+            resolution: manifest.resolution.as_ref(),
+            warnings,
+        };
+        report::write(&run, findings, map, &request.out_dir)
+    }
+
+    /// Writes the maps, two at a time: both halves squeeze the whole map, each on its own core. Meanwhile the defects
+    /// are looked for.
     fn write_maps(
         &mut self,
         map: Option<&mut FinishedMap<'_>>,
+        profile_step_mm: f64,
         progress: &mut Progress<'_, '_>,
-    ) -> Result<(Option<GrayScale>, Option<Picture>)> {
-        let Some(map) = map else { return Ok((None, None)) };
+    ) -> Result<Maps> {
+        let Some(map) = map else { return Ok(Maps::default()) };
         let (folder, wanted) = (&self.request.out_dir, &self.request.products);
         let wants = |group| wanted.contains(&group);
         let text = self.preview_text();
         let tiles = self.tiles.take();
+        let (options, chainage) = (&self.request.recipe.defects, self.request.chainage);
         let shared = SharedMap::new(map);
         std::thread::scope(|scope| {
+            let searching = (wants(ProductGroup::Defects) || wants(ProductGroup::Report)).then(|| {
+                scope.spawn(|| find_defects(&mut shared.reader(), options, chainage, profile_step_mm, folder))
+            });
             let beside = scope.spawn(|| -> Result<Option<Picture>> {
                 if wants(ProductGroup::Depth) {
                     depth_tif::write(&mut shared.reader(), &folder.join("depth.tif"))?;
@@ -381,12 +431,23 @@ impl<'a> Products<'a> {
                 progress.step("preview")?;
             }
             let picture = beside.join().map_err(|_| Error::internal("maps", "a thread panicked"))??;
-            Ok((gray, picture))
+            let found = match searching {
+                Some(searching) => {
+                    progress.step("defects")?;
+                    searching.join().map_err(|_| Error::internal("defects", "a thread panicked"))??
+                }
+                None => None,
+            };
+            Ok(Maps { gray, picture, found })
         })
     }
 
     fn preview_text(&self) -> PreviewText {
-        PreviewText { title: self.request.source_name.clone(), ..PreviewText::default() }
+        PreviewText {
+            title: self.request.source_name.clone(),
+            start_chainage_mm: self.request.chainage.start_mm,
+            chainage_falls: self.request.chainage.falls,
+        }
     }
 
     fn finish_archive(
@@ -414,6 +475,35 @@ impl<'a> Products<'a> {
         self.announcements(segments).into_iter().try_for_each(|event| progress.send(event))?;
         Ok(stretches)
     }
+}
+
+/// What writing the maps leaves.
+#[derive(Default)]
+struct Maps {
+    /// The gray values of `depth.png`.
+    gray: Option<GrayScale>,
+    /// The picture for people.
+    picture: Option<Picture>,
+    /// The defects, and how long it took to find them.
+    found: Option<(Findings, Duration)>,
+}
+
+/// Depth map ▶ defects ▶ their files; `None` where too little was measured.
+fn find_defects(
+    map: &mut dyn MapReader,
+    options: &DefectOptions,
+    chainage: Chainage,
+    profile_step_mm: f64,
+    folder: &Path,
+) -> Result<Option<(Findings, Duration)>> {
+    let start = Instant::now();
+    let mut residual = ResidualWriter::new(folder, residual_tif::NAME);
+    let found = defects::find(map, options, chainage, profile_step_mm, &mut |strip| residual.push(strip))?;
+    let Some(findings) = found else { return Ok(None) };
+    residual.finish()?;
+    defect_list::write(&findings.list, folder)?;
+    sections_csv::write(&findings.sections, folder)?;
+    Ok(Some((findings, start.elapsed())))
 }
 
 fn make<T>(wanted: bool, create: impl FnOnce() -> Result<T>) -> Result<Option<T>> {

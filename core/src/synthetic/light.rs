@@ -88,7 +88,7 @@ impl<'a> FrameView<'a> {
                 super::Shape::Pipe { radius_mm } => 0.98 * radius_mm as f32,
             },
             laser_rgb: laser_rgb(rig.laser.colour),
-            has_steps: !scene.wall.steps.is_empty(),
+            has_steps: scene.wall.has_edges(),
             ground: view,
         }
     }

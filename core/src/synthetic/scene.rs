@@ -3,7 +3,7 @@
 use nalgebra::Vector3;
 
 use super::motion::Motion;
-use super::wall::{Bumps, Shape, StepRow, Wall};
+use super::wall::{Block, Bump, Bumps, Shape, StepRow, Wall};
 use crate::error::{Error, Result};
 use crate::geometry::Plane;
 use crate::rig::{Camera, Laser, LaserColour, LineDirection, Rig};
@@ -83,8 +83,13 @@ pub struct SensorNoise {
 pub struct Scene {
     /// Its name.
     pub name: String,
-    /// The surface; its `seed` is set by the simulation's own.
+    /// The surface; its `seed` is set by the simulation's own, or by `wall_seed`.
     pub wall: Wall,
+    /// What makes one wall differ from another, where it shall not be what makes one run differ from another: two runs
+    /// along one wall.
+    pub wall_seed: Option<u64>,
+    /// Show the wall some time later ([`Wall::age`]).
+    pub later: bool,
     /// What the surface looks like.
     pub material: Material,
     /// Where its texture is seen.
@@ -112,7 +117,7 @@ pub struct Scene {
 }
 
 /// The names of all scenes, with one line of explanation each.
-pub const SCENES: [(&str, &str); 11] = [
+pub const SCENES: [(&str, &str); 14] = [
     ("wall", "a concrete wall at 850 mm with dents and bulges up to 18 mm; wheels"),
     ("pipe", "a fiberglass pipe at 450 mm, radius 300 mm, with a highlight; a walking robot's jitter"),
     ("pipe-steady", "the same pipe from a rail"),
@@ -124,6 +129,9 @@ pub const SCENES: [(&str, &str); 11] = [
     ("low-light", "the wall in near darkness: much noise, a weak laser"),
     ("white", "a white wall: the line's core is white and wide"),
     ("black", "a black wall: a faint line"),
+    ("damaged", "a wall with dents, bulges, a hole, a place broken off and a block that stands out"),
+    ("sound", "a wall with slow waves and no defect at all"),
+    ("pipe-oval", "a pipe without defects whose section is oval by 1 %"),
 ];
 
 impl Scene {
@@ -139,6 +147,12 @@ impl Scene {
             "distractor" => Scene { distractors: true, ..wall() },
             "no-laser" => Scene { laser: LaserLight { on: false, ..wall().laser }, ..wall() },
             "stop" => Scene { motion: Motion::Stop, ..wall() },
+            "damaged" => Scene::damaged(),
+            "sound" => Scene { wall: Wall { bumps: None, ..wall().wall }, ..wall() },
+            "pipe-oval" => {
+                let pipe = Scene::pipe();
+                Scene { wall: Wall { bumps: None, ovality: 0.01, ..pipe.wall }, ..pipe }
+            }
             _ => {
                 let names: Vec<&str> = SCENES.iter().map(|s| s.0).collect();
                 return Err(Error::input("scene", format!("'{name}'"), format!("one of {}", names.join(", "))));
@@ -165,10 +179,15 @@ impl Scene {
                 shape: Shape::Flat,
                 distance_mm: 850.0,
                 bumps: Some(Bumps { cell_mm: 720.0, height_mm: 17.0, radius_mm: 85.0, y_half_mm: 165.0 }),
+                ovality: 0.0,
+                placed: Vec::new(),
+                blocks: Vec::new(),
                 waves_mm: 1.2,
                 steps: Vec::new(),
                 seed: 0,
             },
+            wall_seed: None,
+            later: false,
             material: Material { albedo: 0.36, contrast: 0.5, spots: true, gloss: 0.0, tint: [1.0, 1.01, 0.93] },
             texture: TextureReach::Everywhere,
             distractors: false,
@@ -200,6 +219,19 @@ impl Scene {
             motion: Motion::Gait,
             ..wall
         }
+    }
+
+    fn damaged() -> Scene {
+        let wall = Scene::concrete();
+        let block = |x: f64, y: f64, half_x: f64, half_y: f64, height: f64| Block { x, y, half_x, half_y, height };
+        let bump = |x: f64, y: f64, r: f64, height: f64| Bump { x, y, r, height };
+        let blocks = vec![
+            block(220.0, -120.0, 30.0, 25.0, 25.0),
+            block(360.0, 110.0, 50.0, 30.0, 5.0),
+            block(480.0, -60.0, 25.0, 25.0, -6.0),
+        ];
+        let placed = vec![bump(250.0, 40.0, 20.0, 3.0), bump(620.0, 90.0, 45.0, -8.0), bump(640.0, -110.0, 70.0, 12.0)];
+        Scene { wall: Wall { bumps: None, blocks, placed, ..wall.wall }, ..wall }
     }
 
     fn step_gauge() -> Scene {
@@ -244,7 +276,9 @@ impl Scene {
     pub fn without_relief(mut self) -> Scene {
         self.wall.bumps = None;
         self.wall.waves_mm = 0.0;
+        self.wall.placed.clear();
         self.wall.steps.clear();
+        self.wall.blocks.clear();
         self
     }
 

@@ -58,6 +58,21 @@ pub struct StepRow {
     pub x_on: f64,
 }
 
+/// A block with steep sides: a pit or a hole (height above 0: away from the camera), or something that stands out.
+#[derive(Clone, Copy, Debug, PartialEq, Serialize)]
+pub struct Block {
+    /// Centre, mm.
+    pub x: f64,
+    /// Centre, mm.
+    pub y: f64,
+    /// Half of its length along x, mm.
+    pub half_x: f64,
+    /// Half of its width along y, mm.
+    pub half_y: f64,
+    /// Height, mm.
+    pub height: f64,
+}
+
 /// The surface of a scene.
 #[derive(Clone, Debug, PartialEq)]
 pub struct Wall {
@@ -65,8 +80,14 @@ pub struct Wall {
     pub shape: Shape,
     /// Distance of the undamaged surface from the camera at its first frame, mm.
     pub distance_mm: f64,
+    /// A pipe's (largest − smallest diameter) / mean, its largest along z; 0 = round.
+    pub ovality: f64,
     /// Dents and bulges, if any.
     pub bumps: Option<Bumps>,
+    /// Dents and bulges at given places besides; one at the very place and with the radius of another deepens it.
+    pub placed: Vec<Bump>,
+    /// Blocks and pits at given places.
+    pub blocks: Vec<Block>,
     /// Greatest height of the long waves of a surface that is not quite even, mm; 0 = even.
     pub waves_mm: f64,
     /// Blocks.
@@ -86,8 +107,18 @@ impl Wall {
     pub fn exists(&self, y_mm: f64) -> bool {
         match self.shape {
             Shape::Flat => true,
-            Shape::Pipe { radius_mm } => y_mm.abs() <= PIPE_SEEN * radius_mm,
+            Shape::Pipe { radius_mm } => y_mm.abs() <= PIPE_SEEN * self.half_axes_mm(radius_mm).0,
         }
+    }
+
+    /// True where the surface has steep sides: it is no smooth function of (x, y).
+    pub(super) fn has_edges(&self) -> bool {
+        !self.steps.is_empty() || !self.blocks.is_empty()
+    }
+
+    /// Half axes of a pipe's section along y and z, mm.
+    fn half_axes_mm(&self, radius_mm: f64) -> (f64, f64) {
+        (radius_mm * (1.0 - 0.5 * self.ovality), radius_mm * (1.0 + 0.5 * self.ovality))
     }
 
     /// The undamaged shape's z, mm; continued steeply beyond a pipe's sides.
@@ -95,23 +126,25 @@ impl Wall {
         match self.shape {
             Shape::Flat => self.distance_mm,
             Shape::Pipe { radius_mm } => {
-                let limit = PIPE_SEEN * radius_mm;
-                let inside = y_mm.abs().min(limit);
-                let drop = (radius_mm * radius_mm - inside * inside).sqrt();
-                self.distance_mm + radius_mm - drop + (y_mm.abs() - inside) * inside / drop
+                let (half_y, half_z) = self.half_axes_mm(radius_mm);
+                let inside = y_mm.abs().min(PIPE_SEEN * half_y);
+                let drop = (half_y * half_y - inside * inside).sqrt();
+                self.distance_mm + half_z / half_y * (half_y - drop + (y_mm.abs() - inside) * inside / drop)
             }
         }
     }
 
     /// The nearest and the farthest z that the surface can have, mm.
     pub(super) fn z_range_mm(&self) -> (f64, f64) {
-        let bump = self.bumps.map_or(0.0, |b| 1.6 * b.height_mm);
+        let placed = self.placed.iter().map(|b| b.height.abs()).sum::<f64>();
+        let bump = self.bumps.map_or(0.0, |b| 1.6 * b.height_mm) + placed;
+        let block = self.blocks.iter().map(|b| b.height.abs()).fold(0.0, f64::max);
         let step = self.steps.iter().map(|s| s.height).fold(0.0, f64::max);
         let far = match self.shape {
             Shape::Flat => self.distance_mm,
             Shape::Pipe { radius_mm } => self.base_z_mm(PIPE_SEEN * radius_mm),
         };
-        (self.distance_mm - bump - self.waves_mm - step - 0.5, far + bump + self.waves_mm + 0.5)
+        (self.distance_mm - bump - self.waves_mm - step - block - 0.5, far + bump + self.waves_mm + block + 0.5)
     }
 
     /// The part of the surface between two x, ready for many questions.
@@ -132,14 +165,43 @@ impl Wall {
 
     /// The bumps that reach into a stretch of x.
     pub fn bumps_between(&self, x_min_mm: f64, x_max_mm: f64) -> Vec<Bump> {
-        let Some(bumps) = self.bumps else { return Vec::new() };
-        let reach = 1.2 * bumps.radius_mm;
-        let first = ((x_min_mm - reach) / bumps.cell_mm).floor() as i64;
-        let last = ((x_max_mm + reach) / bumps.cell_mm).floor() as i64;
-        (first..=last)
-            .flat_map(|cell| self.bumps_of_cell(&bumps, cell))
-            .filter(|b| b.x + b.r >= x_min_mm && b.x - b.r <= x_max_mm)
-            .collect()
+        let mut all: Vec<Bump> = match self.bumps {
+            Some(bumps) => {
+                let reach = 1.2 * bumps.radius_mm;
+                let first = ((x_min_mm - reach) / bumps.cell_mm).floor() as i64;
+                let last = ((x_max_mm + reach) / bumps.cell_mm).floor() as i64;
+                (first..=last).flat_map(|cell| self.bumps_of_cell(&bumps, cell)).collect()
+            }
+            None => Vec::new(),
+        };
+        for placed in &self.placed {
+            match all.iter_mut().find(|b| (b.x, b.y, b.r) == (placed.x, placed.y, placed.r)) {
+                Some(known) => known.height += placed.height,
+                None => all.push(*placed),
+            }
+        }
+        all.retain(|b| b.x + b.r >= x_min_mm && b.x - b.r <= x_max_mm);
+        all
+    }
+
+    /// What became of the wall some time later: the first large dent past `x_mm` is 2 mm deeper, and beyond it there is a new
+    /// one, 4 mm deep and 30 mm in radius, clear of the others.
+    pub fn age(&mut self, x_mm: f64) {
+        let bumps = self.bumps_between(x_mm, x_mm + 1500.0);
+        let deeper = bumps
+            .iter()
+            .filter(|b| b.height > 2.0 && b.r > 30.0 && b.x - b.r > x_mm)
+            .min_by(|a, b| a.x.total_cmp(&b.x))
+            .copied();
+        self.placed.extend(deeper.map(|dent| Bump { height: 2.0, ..dent }));
+        let new = |i: u32| Bump {
+            x: x_mm + 60.0 + 15.0 * f64::from(i / 8),
+            y: 35.0 * f64::from(i % 8) - 122.5,
+            r: 30.0,
+            height: 4.0,
+        };
+        let clear = |new: &Bump| bumps.iter().all(|b| (b.x - new.x).hypot(b.y - new.y) > b.r + new.r + 15.0);
+        self.placed.extend((0..400).map(new).find(clear));
     }
 
     fn bumps_of_cell(&self, bumps: &Bumps, cell: i64) -> [Bump; 8] {
@@ -210,6 +272,10 @@ impl WallWindow<'_> {
         for step in &self.wall.steps {
             z -= step.height * step_inside(step, x_mm, y_mm);
         }
+        for block in &self.wall.blocks {
+            let (beside_x, beside_y) = (block.half_x - (x_mm - block.x).abs(), block.half_y - (y_mm - block.y).abs());
+            z += block.height * flank(beside_x) * flank(beside_y);
+        }
         z
     }
 
@@ -247,12 +313,16 @@ impl WallWindow<'_> {
 
 /// 1 on a block, 0 beside it, a short ramp between.
 fn step_inside(step: &StepRow, x_mm: f64, y_mm: f64) -> f64 {
-    let ramp = |inside_mm: f64| (0.5 + inside_mm / (2.0 * FLANK_HALF_MM)).clamp(0.0, 1.0);
     let x = x_mm.rem_euclid(step.x_period);
     // Distance inside the block along x, also for a point just before the next block's start.
     let inside_x = (0.5 * step.x_on) - (x - 0.5 * step.x_on).abs().min((x - step.x_period - 0.5 * step.x_on).abs());
     let inside_y = step.half - (y_mm - step.y).abs();
-    ramp(inside_x) * ramp(inside_y)
+    flank(inside_x) * flank(inside_y)
+}
+
+/// From 0 to 1 across a block's side.
+fn flank(inside_mm: f64) -> f64 {
+    (0.5 + inside_mm / (2.0 * FLANK_HALF_MM)).clamp(0.0, 1.0)
 }
 
 /// The zero of `f` between two points where it has opposite signs (Illinois' variant of the false position).
@@ -292,7 +362,17 @@ mod tests {
 
     fn bumpy() -> Wall {
         let bumps = Bumps { cell_mm: 700.0, height_mm: 17.0, radius_mm: 90.0, y_half_mm: 160.0 };
-        Wall { shape: Shape::Flat, distance_mm: 850.0, bumps: Some(bumps), waves_mm: 1.0, steps: vec![], seed: 5 }
+        Wall {
+            shape: Shape::Flat,
+            distance_mm: 850.0,
+            ovality: 0.0,
+            bumps: Some(bumps),
+            placed: vec![],
+            blocks: vec![],
+            waves_mm: 1.0,
+            steps: vec![],
+            seed: 5,
+        }
     }
 
     #[test]
@@ -324,6 +404,26 @@ mod tests {
         assert!((z_at(20.0) - 430.0).abs() < 1e-6, "a block's top");
         let flank = z_at(153.0);
         assert!(flank > 430.1 && flank < 449.9, "a flank at {flank} mm");
+    }
+
+    #[test]
+    fn an_oval_pipe_is_wider_along_the_view() {
+        let pipe =
+            Wall { shape: Shape::Pipe { radius_mm: 300.0 }, ovality: 0.01, bumps: None, waves_mm: 0.0, ..bumpy() };
+        let (z, y) = (pipe.base_z_mm(200.0) - pipe.distance_mm - 301.5, 200.0 / 298.5);
+        assert!(((z / 301.5).powi(2) + y * y - 1.0).abs() < 1e-9);
+    }
+
+    #[test]
+    fn a_wall_ages_by_a_deeper_dent_and_a_new_one() {
+        let mut later = bumpy();
+        later.age(300.0);
+        let (before, after) = (bumpy().bumps_between(0.0, 3000.0), later.bumps_between(0.0, 3000.0));
+        assert_eq!(after.len(), before.len() + 1);
+        let grown: Vec<f64> =
+            before.iter().zip(&after).map(|(a, b)| b.height - a.height).filter(|h| *h != 0.0).collect();
+        assert_eq!(grown.len(), 1);
+        assert!((grown[0] - 2.0).abs() < 1e-12);
     }
 
     #[test]

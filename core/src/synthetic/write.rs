@@ -233,7 +233,7 @@ impl TruthWriter {
 fn write_surface(simulation: &Simulation, folder: &Path) -> Result<()> {
     let wall = &simulation.scene().wall;
     let ((x0, x1), (y0, y1)) = simulation.seen_mm();
-    let mut step = if wall.steps.is_empty() { 2.0 } else { 1.0 };
+    let mut step = if wall.has_edges() { 1.0 } else { 2.0 };
     while (x1 - x0) * (y1 - y0) / (step * step) > MAX_SURFACE_NODES {
         step *= 2.0;
     }
@@ -263,6 +263,8 @@ fn surface_json(simulation: &Simulation, (x0, x1): (f64, f64), y0: f64, step: f6
     };
     let bumps = wall.bumps_between(x0, x1).into_iter().map(|b| with_kind("bump", json!(b)));
     let steps = wall.steps.iter().map(|s| with_kind("step", json!(s)));
+    let blocks = wall.blocks.iter().filter(|b| b.x + b.half_x >= x0 && b.x - b.half_x <= x1);
+    let blocks = blocks.map(|b| with_kind("block", json!(b)));
     let rig = simulation.rig();
     let n = rig.laser.plane.normal;
     // The plane in the paper's form X − Z/tan β = d, along the axis that the laser lies on.
@@ -275,11 +277,12 @@ fn surface_json(simulation: &Simulation, (x0, x1): (f64, f64), y0: f64, step: f6
         "x0_mm": x0,
         "y0_mm": y0,
         "step_mm": step,
-        "features": bumps.chain(steps).collect::<Vec<Value>>(),
+        "features": bumps.chain(steps).chain(blocks).collect::<Vec<Value>>(),
         "C1": rig.camera.fx_px * baseline_mm,
         "baseline_mm": baseline_mm,
         "angle_deg": across.atan2(-n.z).to_degrees(),
         "z_nominal_mm": wall.distance_mm,
+        "ovality": wall.ovality,
         "scene": simulation.scene().name,
         "seed": wall.seed,
     })

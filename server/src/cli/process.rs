@@ -10,6 +10,7 @@ use std::sync::atomic::{AtomicBool, Ordering};
 use std::time::Instant;
 
 use clap::Args;
+use stria_core::defects::Chainage;
 use stria_core::export::manifest::Manifest;
 use stria_core::pipeline::{self, Event, ProductGroup, Request};
 use stria_core::recipe::{self, OptionInfo, Range, Recipe};
@@ -71,6 +72,15 @@ pub(super) struct Process {
     /// When the run was recorded (RFC 3339); when nothing is said, the time of the file
     #[arg(long, value_name = "TIME")]
     recorded_at: Option<jiff::Timestamp>,
+    /// The name of the asset, for the report
+    #[arg(long, value_name = "NAME", default_value = "", hide_default_value = true)]
+    asset: String,
+    /// Chainage of the run's first frame, mm
+    #[arg(long, value_name = "MM", default_value_t = 0.0, allow_negative_numbers = true)]
+    chainage_mm: f64,
+    /// Which way the robot went along the asset: backward, the chainage falls
+    #[arg(long, value_parser = ["forward", "backward"], default_value = "forward")]
+    direction: String,
     /// The name of the source in messages and the manifest
     #[arg(long, hide = true)]
     name: Option<String>,
@@ -143,14 +153,7 @@ impl Process {
             (None, None) => Recipe::load(recipe::BUILT_IN[0])?,
         };
         for change in &self.set {
-            let Some((key, value)) = change.split_once('=') else {
-                return Err(stria_core::Error::input(
-                    format!("--set {change}"),
-                    "no '='",
-                    "key=value, such as stripe.k=0.8",
-                ));
-            };
-            recipe.set(key.trim(), value.trim())?;
+            recipe.set_pair(change)?;
         }
         let name = self.source.file_name().map(|n| n.to_string_lossy().into_owned());
         let name = self.name.clone().or(name).unwrap_or_else(|| self.source.display().to_string());
@@ -163,6 +166,8 @@ impl Process {
             source_name: name,
             fps: self.fps,
             recorded_at: self.recorded_at.or(captured_at).unwrap_or_else(|| time_of(&self.source)),
+            asset: self.asset.clone(),
+            chainage: Chainage { start_mm: self.chainage_mm, falls: self.direction == "backward" },
             rig,
             recipe,
             poses: self.poses.clone().or_else(|| archived.poses()),

@@ -38,6 +38,12 @@ pub(super) struct SimulateArgs {
     /// What makes one run differ from another; the same seed gives the same run
     #[arg(long, value_name = "N", default_value_t = 1)]
     seed: u64,
+    /// What makes one wall differ from another, where it is not the seed: two runs along the same wall
+    #[arg(long, value_name = "N")]
+    wall_seed: Option<u64>,
+    /// The wall some time later: one dent is 2 mm deeper, and there is a new one
+    #[arg(long)]
+    later: bool,
     /// Colour of the laser instead of the scene's
     #[arg(long, value_enum)]
     laser: Option<ColourArg>,
@@ -167,6 +173,8 @@ fn board_photos(args: &SimulateArgs, stop: &AtomicBool) -> std::result::Result<(
 
 fn scene(args: &SimulateArgs) -> Result<Scene> {
     let mut scene = Scene::named(&args.scene)?;
+    scene.wall_seed = args.wall_seed;
+    scene.later = args.later;
     if let Some(colour) = args.laser {
         scene.colour = colour.into();
     }

@@ -51,6 +51,12 @@ pub struct Lease {
     pub recorded_ms: i64,
     /// True for a job of a batch.
     pub in_batch: bool,
+    /// The asset.
+    pub asset: String,
+    /// Chainage of the first frame, mm.
+    pub chainage_mm: f64,
+    /// Which way the robot went along the asset: `forward` or `backward`.
+    pub direction: String,
 }
 
 impl Lease {
@@ -63,6 +69,9 @@ impl Lease {
             rig_toml: job.rig_toml,
             recipe_toml: job.recipe_toml,
             filename: run.filename,
+            asset: run.asset,
+            chainage_mm: run.chainage_mm,
+            direction: run.direction,
             source_extension: run.source_extension,
             source_kind: run.source_kind,
             source: Facts { bytes: run.source_bytes.unsigned_abs(), sha256: run.source_sha256 },

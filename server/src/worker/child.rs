@@ -65,7 +65,8 @@ impl Child {
         command.arg("--rig").arg(scratch.rig()).arg("--recipe").arg(scratch.recipe()).arg("--out").arg(scratch.out());
         command.arg("--recorded-at").arg(to_text(lease.recorded_ms));
         // One word, so that a name that begins with a dash is no flag.
-        command.arg(format!("--name={}", lease.filename));
+        command.arg(format!("--name={}", lease.filename)).arg(format!("--asset={}", lease.asset));
+        command.arg(format!("--chainage-mm={}", lease.chainage_mm)).arg(format!("--direction={}", lease.direction));
         if let Some(fps) = lease.fps {
             command.arg(format!("--fps={fps}"));
         }

@@ -23,6 +23,15 @@ const SCATTER_STEP: usize = 4;
 /// The errors of neighbouring spots are alike (the wall's pattern is coarser than a row): averaging helps less than it
 /// would with independent errors. Measured on simulated walls and pipes.
 const ALIKE: f32 = 3.4;
+/// How many times more than on an even wall the line bends where there is a dent.
+const SUPPLE: f32 = 15.0;
+/// Line positions on each side that tell whether it does, and how much of that is chance.
+const TRUE_REACH: usize = 10;
+const BY_CHANCE: f32 = 1.0;
+/// As [`ALIKE`], for the difference of the two lines: what lies far apart cancels in it.
+const ALIKE_APART: f32 = 2.4;
+/// A line that is less sure than this stays stiff.
+const UNSURE_PX: f32 = 0.4;
 /// A piece shorter than this that stands apart from the line on both sides is believed only where it is sure.
 const ISLAND_ROWS: usize = 48;
 const ISLAND_SIGMA_PX: f32 = 0.3;
@@ -40,9 +49,9 @@ pub(super) fn smooth(stripe: &mut Stripe, options: &SpotOptions) {
             piece.iter().for_each(|spot| drop_spot(stripe, spot.position));
             continue;
         }
-        let first = smoother(&piece, bend);
+        let first = smoother(&piece, SUPPLE * bend);
         doubt(&mut piece, &first);
-        let smooth = smoother(&piece, bend);
+        let smooth = as_smooth_as_true(&smoother(&piece, bend), &smoother(&piece, SUPPLE * bend));
         let sigma = |variance: f32| ALIKE * variance.max(0.0).sqrt();
         let middle = sigma(smooth[piece.len() / 2].1);
         if piece.len() < ISLAND_ROWS && middle > ISLAND_SIGMA_PX {
@@ -149,6 +158,29 @@ fn doubt(piece: &mut [Spot], smooth: &[(f32, f32)]) {
         let outlier = (scaled[i] / (OUTLIER_SIGMAS * scatter)).max(1.0);
         spot.sigma *= scatter * outlier * outlier;
     }
+}
+
+/// The stiff line, and the supple one where it differs by more than chance: a dent of some dozen rows would lose half of
+/// its depth on the stiff one.
+fn as_smooth_as_true(stiff: &[(f32, f32)], supple: &[(f32, f32)]) -> Vec<(f32, f32)> {
+    // The stiff line's error is part of the supple one's: their difference has the difference of the variances.
+    let chance =
+        |(a, b): (&(f32, f32), &(f32, f32))| (b.0 - a.0).powi(2) / (ALIKE_APART * ALIKE_APART * (b.1 - a.1).max(1e-8));
+    let mut sums = vec![0.0; stiff.len() + 1];
+    for (i, pair) in stiff.iter().zip(supple).enumerate() {
+        sums[i + 1] = sums[i] + chance(pair).min(100.0);
+    }
+    (0..stiff.len())
+        .map(|i| {
+            let (from, to) = (i.saturating_sub(TRUE_REACH), (i + TRUE_REACH + 1).min(stiff.len()));
+            let mean = (sums[to] - sums[from]) / (to - from) as f32;
+            // A highlight's line would bend anyhow: there a spot knows little.
+            let sure = 1.0 / (1.0 + (ALIKE * ALIKE * supple[i].1 / (UNSURE_PX * UNSURE_PX)).powi(2));
+            let share = sure * (1.0 - BY_CHANCE / mean.max(1e-6)).max(0.0);
+            let between = |a: f32, b: f32| a + share * (b - a);
+            (between(stiff[i].0, supple[i].0), between(stiff[i].1, supple[i].1))
+        })
+        .collect()
 }
 
 /// Position and slope forwards (Kalman), then backwards: position and its variance for each spot.

@@ -1,0 +1,107 @@
+//! The search on maps that are known: what is on them, and nothing else.
+
+use super::*;
+use crate::depth_map::{GridMap, MapGeometry};
+use crate::recipe::Recipe;
+
+/// A raised cosine: (x, y, radius, height), mm.
+type Bump = (f64, f64, f64, f64);
+
+/// A number from −1 to 1 that looks random.
+fn noise(i: usize) -> f64 {
+    let hashed = (i as u64).wrapping_mul(0x9E37_79B9_7F4A_7C15);
+    let mixed = (hashed ^ (hashed >> 29)).wrapping_mul(0xBF58_476D_1CE4_E5B9);
+    ((mixed ^ (mixed >> 32)) % 20_001) as f64 / 10_000.0 - 1.0
+}
+
+fn map(width_px: usize, base: impl Fn(f64, f64) -> f64, bumps: &[Bump], hole: impl Fn(f64, f64) -> bool) -> GridMap {
+    let geometry = MapGeometry { x0_mm: 50.0, y0_mm: -300.0, mm_per_px: 1.0, width_px, height_px: 600 };
+    GridMap::from_fn(geometry, |column, row| {
+        let (x, y) = (50.0 + column as f64, -300.0 + row as f64);
+        let mut z = base(x, y) + 0.2 * noise(row * width_px + column);
+        for (cx, cy, radius, height) in bumps {
+            let away = (x - cx).hypot(y - cy) / radius;
+            if away < 1.0 {
+                z += height * (std::f64::consts::FRAC_PI_2 * away).cos().powi(2);
+            }
+        }
+        (if hole(x, y) { f32::NAN } else { z as f32 }, None)
+    })
+}
+
+fn found(map: &mut GridMap) -> Findings {
+    let recipe = Recipe::default();
+    find(map, &recipe.defects, Chainage { start_mm: 1000.0, falls: false }, 5.0, &mut |_| Ok(()))
+        .expect("find")
+        .expect("measured")
+}
+
+fn wall(x: f64, y: f64) -> f64 {
+    850.0 + 0.02 * x - 0.03 * y + 0.8 * (x / 90.0).sin() * (y / 110.0).cos()
+}
+
+const BUMPS: [Bump; 6] = [
+    (200.0, -150.0, 25.0, 3.0),
+    (420.0, 100.0, 90.0, -15.0),
+    (600.0, -100.0, 60.0, 9.0),
+    (690.0, -90.0, 40.0, -6.0),
+    (1200.0, 50.0, 20.0, 3.0),
+    (2350.0, 0.0, 50.0, -5.0),
+];
+
+#[test]
+fn dents_and_bulges_are_found_with_their_figures_and_nothing_else() {
+    // 5,000 mm: two stretches.
+    let found = found(&mut map(5000, wall, &BUMPS, |_, _| false));
+    assert_eq!(found.list.reference.kind, "plane");
+    assert_eq!(found.list.defects.len(), BUMPS.len(), "{:#?}", found.list.defects);
+    for (defect, (x, y, radius, height)) in found.list.defects.iter().zip(BUMPS) {
+        let off = (defect.x_mm - x).hypot(defect.y_mm - y);
+        assert!(off < 2.0, "{off} mm off: {defect:#?}");
+        assert!((defect.depth_mm - height).abs() < f64::max(0.3, 0.05 * height.abs()), "{height} mm: {defect:#?}");
+        let area_mm2 = std::f64::consts::PI * radius * radius;
+        assert!((defect.area_mm2 / area_mm2 - 1.0).abs() < 0.15, "{area_mm2} mm²: {defect:#?}");
+        assert!((defect.length_mm / (2.0 * radius) - 1.0).abs() < 0.2, "{defect:#?}");
+        // The volume of a raised cosine is h·π·r²·(1/2 − 2/π²).
+        let volume_mm3 = height.abs() * area_mm2 * (0.5 - 2.0 / std::f64::consts::PI.powi(2));
+        assert!((defect.volume_mm3 / volume_mm3 - 1.0).abs() < 0.15, "{volume_mm3} mm³: {defect:#?}");
+        assert_eq!(defect.kind, if height > 0.0 { DefectKind::Dent } else { DefectKind::Bulge });
+        assert!((defect.chainage_mm - defect.x_mm - 1000.0).abs() < 1e-9 && defect.height_mm == Some(-defect.y_mm));
+        assert!(defect.confidence > 0.9, "{defect:#?}");
+    }
+    assert!(found.sections.len() >= 49 && found.sections.iter().all(|s| s.flatness_mm.is_some()));
+}
+
+#[test]
+fn an_empty_wall_gives_an_empty_list_and_a_limit() {
+    let found = found(&mut map(1500, wall, &[], |_, _| false));
+    assert!(found.list.defects.is_empty(), "{:#?}", found.list.defects);
+    let limit = found.list.detection_limit_mm;
+    assert!(limit >= 0.5 && limit < 1.5, "{limit}");
+}
+
+#[test]
+fn a_pipe_with_a_highlight_is_no_list_of_gaps() {
+    let pipe = |_: f64, y: f64| 750.0 - (300.0_f64.powi(2) - (y * 0.6).powi(2)).sqrt();
+    let bumps = [(300.0, 100.0, 20.0, 2.0), (700.0, -40.0, 40.0, -4.0)];
+    // A band without measurements across the second bump.
+    let found = found(&mut map(1500, pipe, &bumps, |x, y| (y + 40.0 + 4.0 * (x / 30.0).sin()).abs() < 6.0));
+    assert_eq!(found.list.reference.kind, "cylinder");
+    assert_eq!(found.list.defects.len(), 2, "{:#?}", found.list.defects);
+    let [dent, bulge] = &found.list.defects[..] else { unreachable!("two") };
+    assert!((dent.depth_mm - 2.0).abs() < 0.25 && (bulge.depth_mm + 4.0).abs() < 0.5, "{dent:#?} {bulge:#?}");
+    assert!(bulge.measured_share < 1.0 && dent.clock_h.is_some_and(|h| h > 3.0 && h < 4.5), "{dent:#?}");
+}
+
+#[test]
+fn blocks_and_pits_with_steep_sides_have_their_own_names() {
+    let block = |x: f64, y: f64, z: f64| if (400.0..500.0).contains(&x) && (-50.0..0.0).contains(&y) { z } else { 0.0 };
+    for (height, kind) in [(-4.0, DefectKind::Step), (4.0, DefectKind::MissingMaterial), (30.0, DefectKind::Hole)] {
+        let found = found(&mut map(1200, |x, y| wall(x, y) + block(x, y, height), &[], |_, _| false));
+        assert_eq!(found.list.defects.len(), 1, "{:#?}", found.list.defects);
+        let defect = &found.list.defects[0];
+        assert_eq!(defect.kind, kind, "{defect:#?}");
+        assert!((defect.depth_mm / height - 1.0).abs() < 0.1, "{defect:#?}");
+        assert!((defect.area_mm2 / 5000.0 - 1.0).abs() < 0.1 && (defect.length_mm - 100.0).abs() < 6.0, "{defect:#?}");
+    }
+}
