@@ -43,6 +43,7 @@ export const texts = {
     done: "Done",
     failed: "Failed",
     cancelled: "Cancelled",
+    paused: "Paused",
   } satisfies Record<JobState, string>,
   runs: {
     title: "Runs",
