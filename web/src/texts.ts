@@ -37,6 +37,7 @@ export const texts = {
     uploadCut: "The connection broke before the whole file had arrived. Nothing was kept; send it again.",
   },
   progressBar: "Progress of the measurement",
+  frames: (frames: string) => `${frames} frames`,
   state: {
     queued: "Waiting",
     running: "Working",

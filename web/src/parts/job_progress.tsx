@@ -1,10 +1,9 @@
 // How far a job is, why it stopped, and what can be done about it.
 
 import { cancelJob, isActive, retryJob, type Job } from "../api.ts";
-import { percent } from "../format.ts";
-import { texts } from "../texts.ts";
 import { runTexts } from "../texts/run.ts";
 import { ActionButton } from "./action_button.tsx";
+import { farInWords, JobBar } from "./job_bar.tsx";
 import { ProblemBox } from "./problem.tsx";
 import { Warnings } from "./warnings.tsx";
 
@@ -56,14 +55,13 @@ function stageInWords(job: Job): string {
 
 function Numbers({ job }: { job: Job }) {
   const parts = [
-    percent(job.progress),
-    runTexts.progress.frames(job.frames, job.frames_total ?? null),
+    ...new Set([farInWords(job), runTexts.progress.frames(job.frames, job.frames_total ?? null)]),
     ...(job.frames_per_s > 0 ? [runTexts.progress.rate(job.frames_per_s)] : []),
     ...(job.time_left_s ? [runTexts.progress.left(job.time_left_s)] : []),
   ];
   return (
     <>
-      <progress max={1} value={job.progress} aria-label={texts.progressBar} />
+      <JobBar job={job} />
       <p class="faint">{parts.join(" · ")}</p>
     </>
   );

@@ -2,8 +2,8 @@
 
 import { useEffect, useState } from "preact/hooks";
 import { getLiveFrame, getRun, listJobsIn, type Job, type Run } from "../api.ts";
-import { percent } from "../format.ts";
 import { useLoaded, useTitle } from "../hooks.ts";
+import { farInWords, JobBar } from "../parts/job_bar.tsx";
 import { ProblemBox } from "../parts/problem.tsx";
 import { State } from "../parts/state.tsx";
 import { Link, runPath } from "../router.tsx";
@@ -46,7 +46,7 @@ export function LiveView() {
             </p>
             <p class="run-progress">
               <State state={job.state} />
-              <progress max={1} value={job.progress} aria-label={texts.progressBar} /> {percent(job.progress)}
+              <JobBar job={job} /> {farInWords(job)}
             </p>
             <p class="faint">{runTexts.progress.frames(job.frames, job.frames_total ?? null)}</p>
           </li>

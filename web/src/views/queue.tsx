@@ -1,9 +1,10 @@
 // The queue: what is at work, what waits and why, what ended badly, who works.
 
 import { cancelJob, getRun, listJobsIn, listWorkers, retryJob, type Job, type Run, type Worker } from "../api.ts";
-import { count, duration, percent, secondsBetween } from "../format.ts";
+import { count, duration, secondsBetween } from "../format.ts";
 import { useLoaded, useTitle } from "../hooks.ts";
 import { ActionButton } from "../parts/action_button.tsx";
+import { farInWords, JobBar } from "../parts/job_bar.tsx";
 import { ProblemBox } from "../parts/problem.tsx";
 import { State } from "../parts/state.tsx";
 import { Time } from "../parts/time.tsx";
@@ -113,13 +114,13 @@ function Group({ heading, none, entries, tell, onChanged, children }: GroupProps
 
 function AtWork({ job }: { job: Job }) {
   const facts = [
-    percent(job.progress),
+    farInWords(job),
     ...(job.frames_per_s > 0 ? [words.rate(job.frames_per_s)] : []),
     ...(job.time_left_s ? [words.left(job.time_left_s)] : []),
   ];
   return (
     <>
-      <progress max={1} value={job.progress} aria-label={texts.progressBar} />
+      <JobBar job={job} />
       <span class="faint">{job.cancelling ? runTexts.progress.cancelling : facts.join(" · ")}</span>
     </>
   );

@@ -2,9 +2,10 @@
 
 import { useEffect, useMemo, useRef, useState } from "preact/hooks";
 import { getRun, isActive, listAssets, listRuns, problemOf, productPath, type Problem, type Run, type RunFilter } from "../api.ts";
-import { lengthMm, percent, size } from "../format.ts";
+import { lengthMm, size } from "../format.ts";
 import { once, useLoaded, useTitle } from "../hooks.ts";
 import { CommandLine } from "../parts/command_line.tsx";
+import { farInWords, JobBar } from "../parts/job_bar.tsx";
 import { ProblemBox } from "../parts/problem.tsx";
 import { RunFilters } from "../parts/run_filters.tsx";
 import { State } from "../parts/state.tsx";
@@ -221,7 +222,7 @@ function RunRow({ run }: { run: Run }) {
         {job.state === "done" && quality && <Quality rows={quality.rows_found} travel_mm={quality.travel_mm} points={quality.points} warnings={job.warnings.length} />}
         {job.state === "running" && (
           <span class="run-progress">
-            <progress max={1} value={job.progress} aria-label={texts.progressBar} /> {percent(job.progress)}
+            <JobBar job={job} /> {farInWords(job)}
           </span>
         )}
         {job.error && <span class="faint clamp">{job.error.detail}</span>}
