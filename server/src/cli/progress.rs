@@ -56,12 +56,13 @@ impl JobBar {
     }
 }
 
-const BYTES: &str = "{prefix:>14} [{bar:30}] {percent:>3} %  {bytes} of {total_bytes}, {bytes_per_sec}, {eta} left";
+const BYTES: &str = "{prefix:>14} [{bar:30}] {percent:>3} %  {decimal_bytes} of {decimal_total_bytes}, \
+                     {decimal_bytes_per_sec}, {eta} left";
 const FRAMES: &str = "          live {pos} frames, {per_sec}, {msg}";
 
 /// A bar of bytes on stderr.
-pub(super) fn byte_bar(bytes: u64) -> ProgressBar {
-    ProgressBar::new(bytes).with_style(style(BYTES))
+pub(super) fn byte_bar(what: &'static str, bytes: u64) -> ProgressBar {
+    ProgressBar::new(bytes).with_prefix(what).with_style(style(BYTES))
 }
 
 /// A line on stderr for what has no end yet.

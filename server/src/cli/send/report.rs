@@ -3,7 +3,7 @@
 use std::sync::{Arc, Mutex, PoisonError};
 use std::time::{Duration, Instant};
 
-use indicatif::ProgressBar;
+use indicatif::{ProgressBar, ProgressDrawTarget};
 use serde::Serialize;
 use serde_json::Value;
 
@@ -89,10 +89,10 @@ impl Report {
     pub(super) fn begin(&self, what: &'static str, name: &str, offset_bytes: u64, total_bytes: u64) {
         let mut shared = self.shared();
         shared.bar.finish_and_clear();
-        shared.bar = if self.json { ProgressBar::hidden() } else { byte_bar(total_bytes) };
-        shared.bar.set_length(total_bytes);
-        shared.bar.set_prefix(what);
-        shared.bar.set_position(offset_bytes);
+        shared.bar = byte_bar(what, total_bytes).with_position(offset_bytes);
+        if self.json {
+            shared.bar.set_draw_target(ProgressDrawTarget::hidden());
+        }
         // What was there before says nothing about the speed.
         shared.bar.reset_eta();
         shared.name = name.into();
