@@ -33,7 +33,7 @@ use crate::recipe::DefectOptions;
 use cells::{CellGrid, Field};
 use reference::{Place, Shape, choose};
 use section::pooled;
-use stretch::{COARSE, Examined, FIRST_LENGTH, Task, examine};
+use stretch::{COARSE, Examined, FIRST_LENGTH, Task, Threshold, examine};
 
 /// Version of the shape of `defects.json`; grows when a field changes its meaning.
 pub const SCHEMA_VERSION: u32 = 1;
@@ -393,14 +393,21 @@ fn samples(map: &mut dyn MapReader, grid: &CellGrid) -> Result<Vec<Vec<Place>>> 
     Ok(samples)
 }
 
+/// What could be seen in a stretch.
+struct Seen {
+    cells: usize,
+    first: Threshold,
+    last: Threshold,
+    noise_mm: f64,
+}
+
 /// What the stretches show, put together.
 #[derive(Default)]
 struct Gathered {
     defects: Vec<Defect>,
     doubtful: usize,
     sections: Vec<SectionRow>,
-    /// For each stretch: cells, and what the searches there could see.
-    seen: Vec<(usize, [(f64, f64); 2], f64)>,
+    seen: Vec<Seen>,
     measured_cells: usize,
 }
 
@@ -409,7 +416,12 @@ impl Gathered {
         self.doubtful += examined.doubtful;
         self.sections.extend(examined.sections);
         self.measured_cells += examined.measured_cells;
-        self.seen.push((examined.measured_cells, examined.thresholds_mm, examined.noise_mm));
+        self.seen.push(Seen {
+            cells: examined.measured_cells,
+            first: examined.first,
+            last: examined.last,
+            noise_mm: examined.noise_mm,
+        });
         for defect in examined.defects {
             // Two stretches may both claim one on their border.
             let known = self.defects.iter().rev().take(64).any(|d| same_place(d, &defect));
@@ -440,7 +452,7 @@ impl Gathered {
         let (typical, worst) = self.limits(grid, wave_mm);
         let area_mm2 = self.measured_cells as f64 * grid.cell_mm * grid.cell_mm;
         let (length_mm, height_mm) = (grid.columns as f64 * grid.cell_mm, grid.rows as f64 * grid.cell_mm);
-        let noise_mm = reference::median(self.seen.iter().map(|s| s.2).collect()).unwrap_or(0.0);
+        let noise_mm = reference::median(self.seen.iter().map(|s| s.noise_mm).collect()).unwrap_or(0.0);
         let list = DefectList {
             schema_version: SCHEMA_VERSION,
             start_chainage_mm: chainage.start_mm,
@@ -478,12 +490,15 @@ impl Gathered {
 
     fn limits(&self, grid: &CellGrid, wave_mm: f64) -> (Vec<DetectionLimit>, Vec<DetectionLimit>) {
         // The stretch that was seen worst, of those that matter: the list must not promise too much.
-        let most = self.seen.iter().map(|s| s.0).max().unwrap_or(0);
-        let matter = self.seen.iter().filter(|s| 4 * s.0 >= most);
-        let worst_of = |pick: &dyn Fn(&[(f64, f64); 2]) -> f64| matter.clone().map(|s| pick(&s.1)).fold(0.0, f64::max);
+        let most = self.seen.iter().map(|s| s.cells).max().unwrap_or(0);
+        let matter = || self.seen.iter().filter(|s| 4 * s.cells >= most);
+        let worst = |pick: fn(&Seen) -> f64| matter().map(pick).fold(0.0, f64::max);
         let limits =
             |first: f64, last: f64| noise::limits(&[(first, FIRST_LENGTH * wave_mm), (last, wave_mm)], grid.cell_mm);
-        (limits(worst_of(&|t| t[0].0), worst_of(&|t| t[1].0)), limits(worst_of(&|t| t[0].1), worst_of(&|t| t[1].1)))
+        (
+            limits(worst(|s| s.first.typical_mm), worst(|s| s.last.typical_mm)),
+            limits(worst(|s| s.first.bad_mm), worst(|s| s.last.bad_mm)),
+        )
     }
 
     fn reference(&self, shape: Shape, radius_sd_mm: Option<f64>, wave_mm: f64) -> ReferenceShape {

@@ -75,11 +75,11 @@ struct Relief<'a> {
 
 impl Relief<'_> {
     fn ground(&self, cell: usize) -> f32 {
-        let (x, y) = self.from_summit(cell);
+        let (x, y) = self.beside_summit(cell);
         (self.level[0] + self.level[1] * x + self.level[2] * y) as f32
     }
 
-    fn from_summit(&self, cell: usize) -> (f64, f64) {
+    fn beside_summit(&self, cell: usize) -> (f64, f64) {
         let summit = self.region.summit;
         let apart = |a: usize, b: usize| a as f64 - b as f64;
         (apart(cell % self.columns, summit % self.columns), apart(cell / self.columns, summit / self.columns))
@@ -221,7 +221,7 @@ fn surroundings(relief: &Relief, half: (usize, usize)) -> [f64; 3] {
     for row in summit_row.saturating_sub(high as usize)..(summit_row + high as usize + 1).min(rows) {
         for column in summit_column.saturating_sub(wide as usize)..(summit_column + wide as usize + 1).min(columns) {
             let cell = row * columns + column;
-            let (x, y) = relief.from_summit(cell);
+            let (x, y) = relief.beside_summit(cell);
             let value = relief.stretch.smooth.values[cell];
             let outside = (x / inner.0).powi(2) + (y / inner.1).powi(2) > 1.0;
             if outside && value.is_finite() && !relief.stretch.taken[cell] {
@@ -249,7 +249,7 @@ fn summit_mm(relief: &Relief, rough: f32) -> f32 {
             extents(half.into_iter(), relief.columns).map_or(disc, |across| 0.5 * across.0.min(across.1) as f64);
         let reach = (SUMMIT_SHARE * disc.min(narrow)).max(2.0);
         let near = relief.region.cells.iter().filter_map(|cell| {
-            let (dx, dy) = relief.from_summit(*cell);
+            let (dx, dy) = relief.beside_summit(*cell);
             let value = f64::from(relief.measured(*cell));
             (dx * dx + dy * dy <= reach * reach && value.is_finite()).then_some((dx, dy, value))
         });
@@ -345,12 +345,13 @@ fn centre(relief: &Relief, level: f32) -> (f64, f64) {
 fn body(relief: &Relief, top: f32) -> Vec<usize> {
     let upper = connected(relief, 0.5 * top);
     let count = upper.len() as f64;
-    let (x, y) = upper.iter().map(|c| relief.from_summit(*c)).fold((0.0, 0.0), |sum, at| (sum.0 + at.0, sum.1 + at.1));
+    let (x, y) =
+        upper.iter().map(|c| relief.beside_summit(*c)).fold((0.0, 0.0), |sum, at| (sum.0 + at.0, sum.1 + at.1));
     let Some((wide, high)) = extents(upper.into_iter(), relief.columns) else { return Vec::new() };
     let (reach_x, reach_y) = (REACH * wide as f64 + 1.0, REACH * high as f64 + 1.0);
     let mut cells = connected(relief, BODY_LEVEL * top);
     cells.retain(|cell| {
-        let at = relief.from_summit(*cell);
+        let at = relief.beside_summit(*cell);
         (at.0 - x / count).abs() <= reach_x && (at.1 - y / count).abs() <= reach_y
     });
     cells

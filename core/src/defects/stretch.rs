@@ -46,6 +46,21 @@ pub(super) struct Task<'a> {
     pub core: std::ops::Range<usize>,
 }
 
+/// Least height that a search lists.
+#[derive(Clone, Copy, Debug)]
+pub(super) struct Threshold {
+    /// In the median row, mm.
+    pub typical_mm: f64,
+    /// In a row that nine of ten do not exceed, mm.
+    pub bad_mm: f64,
+}
+
+impl Threshold {
+    fn of(rows_mm: &[f32]) -> Threshold {
+        Threshold { typical_mm: quantile(rows_mm, 0.5), bad_mm: quantile(rows_mm, 0.9) }
+    }
+}
+
 /// What a stretch shows.
 pub(super) struct Examined {
     /// Defects whose middle lies in the core, and those of the whole stretch that were too little seen.
@@ -54,8 +69,9 @@ pub(super) struct Examined {
     pub sections: Vec<SectionRow>,
     /// Deviation from the undamaged shape in the core's columns, mm.
     pub residual: Field,
-    /// Typical and bad threshold of the first and the last search, mm.
-    pub thresholds_mm: [(f64, f64); 2],
+    /// What the first and the last search listed.
+    pub first: Threshold,
+    pub last: Threshold,
     pub noise_mm: f64,
     pub measured_cells: usize,
 }
@@ -72,7 +88,7 @@ pub(super) fn examine(task: &Task, depth: &Field) -> Option<Examined> {
     let mut background = robust_plate(&coarse, stiffness(FIRST_LENGTH * wave_cells), LEAST_SCATTER_MM);
     let gaps = near_gaps(&deviation, GAP_CELLS + DOUBT_CELLS);
     let mut search = Search::of(task, &deviation, &background, None);
-    let first = search.thresholds_mm();
+    let first = Threshold::of(&search.thresholds_mm);
     for _ in 0..ROUNDS {
         let masked = masked(&coarse, &search.regions, &search.smooth);
         let weights: Vec<f32> =
@@ -101,13 +117,14 @@ pub(super) fn examine(task: &Task, depth: &Field) -> Option<Examined> {
     let (x_from, x_to) = (grid.x_mm(task.core.start as f64 - 0.5), grid.x_mm(task.core.end as f64 - 0.5));
     let slack_mm = 3.0 * grid.cell_mm;
     let mine = |d: &Defect| d.x_mm >= x_from - slack_mm && d.x_mm <= x_to + slack_mm;
-    let last = (quantile(&thresholds_mm, 0.5), quantile(&thresholds_mm, 0.9));
+    let last = Threshold::of(&thresholds_mm);
     Some(Examined {
         defects: measured.into_iter().flatten().filter(mine).map(|d| placed(d, &reference, options)).collect(),
         doubtful,
         sections: sections(task, depth, &off, &smooth, &free, &reference),
         residual: core_of(task, &off),
-        thresholds_mm: [first, last],
+        first,
+        last,
         noise_mm: f64::from(noise.quantile_mm(0.5)),
         measured_cells: core_of(task, depth).values.iter().filter(|z| z.is_finite()).count(),
     })
@@ -139,10 +156,6 @@ impl Search {
         let mut regions = regions::find(&smooth, &thresholds_mm);
         regions.retain(|region| region.cells.len() > least_cells);
         Search { off, smooth, noise, thresholds_mm, regions, free }
-    }
-
-    fn thresholds_mm(&self) -> (f64, f64) {
-        (quantile(&self.thresholds_mm, 0.5), quantile(&self.thresholds_mm, 0.9))
     }
 }
 
