@@ -491,7 +491,7 @@ impl Gathered {
     fn limits(&self, grid: &CellGrid, wave_mm: f64) -> (Vec<DetectionLimit>, Vec<DetectionLimit>) {
         // The stretch that was seen worst, of those that matter: the list must not promise too much.
         let most = self.seen.iter().map(|s| s.cells).max().unwrap_or(0);
-        let matter = || self.seen.iter().filter(|s| 4 * s.cells >= most);
+        let matter = || self.seen.iter().filter(move |s| 4 * s.cells >= most);
         let worst = |pick: fn(&Seen) -> f64| matter().map(pick).fold(0.0, f64::max);
         let limits =
             |first: f64, last: f64| noise::limits(&[(first, FIRST_LENGTH * wave_mm), (last, wave_mm)], grid.cell_mm);
