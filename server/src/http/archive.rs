@@ -93,10 +93,11 @@ impl ArchiveQuery {
             return Err(Error::field("to_mm", format!("{to_mm}, from_mm {from_mm}"), "a chainage not before from_mm"));
         }
         let some = self.from_mm.is_some() || self.to_mm.is_some();
-        let x_mm = some.then(|| match direction {
+        let range = match direction {
             Direction::Forward => from_mm - start_mm..=to_mm - start_mm,
             Direction::Backward => start_mm - to_mm..=start_mm - from_mm,
-        });
+        };
+        let x_mm = some.then_some(range);
         Ok(ArchiveCut { frames: self.frames.unwrap_or(true), every, x_mm })
     }
 }
