@@ -10,7 +10,7 @@ BUILD="build-essential pkg-config clang libclang-dev libopencv-dev
   libavcodec-dev libavformat-dev libavutil-dev"
 RUN="libopencv-core406 libopencv-imgproc406 libopencv-video406 libopencv-calib3d406
   libavcodec59 libavformat59 libavutil57 ca-certificates"
-TEST="ffmpeg chromium python3-venv curl postgresql"
+TEST="ffmpeg chromium python3-venv curl openssl postgresql"
 
 case "${1:-all}" in
   build) packages="$BUILD" ;;

@@ -2,6 +2,7 @@
 
 mod cluster {
     mod chaos;
+    mod copies;
     mod engines;
     mod many;
 }

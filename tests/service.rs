@@ -2,9 +2,12 @@
 
 mod service {
     mod api;
+    mod batches;
     mod commands;
     mod crashes;
+    mod doors;
     mod jobs;
+    mod keeping;
     mod measure;
     mod refusals;
     mod uploads;

@@ -33,6 +33,15 @@ pub fn run_stria(arguments: &[&str]) -> Output {
     Command::new(stria()).args(arguments).output().expect("the binary starts")
 }
 
+/// Runs the binary to its end, with variables in its environment.
+///
+/// # Panics
+/// Where it cannot be started.
+pub fn run_stria_with(arguments: &[&str], variables: &[(String, String)]) -> Output {
+    let variables = variables.iter().map(|(name, value)| (name, value));
+    Command::new(stria()).args(arguments).envs(variables).output().expect("the binary starts")
+}
+
 /// A simulated run: its video and its rig.
 pub struct Run {
     /// The video.

@@ -1,13 +1,17 @@
 //! The command line: one file per command. A command returns its exit code; errors are said here, once.
 
+mod backup;
+mod bearer;
 mod calibrate;
 mod engine;
 mod inspect;
+mod logging;
 mod process;
 mod progress;
 mod send;
 mod serve;
 mod simulate;
+mod token;
 mod work;
 
 use std::process::ExitCode;
@@ -30,6 +34,9 @@ enum Command {
     Calibrate(calibrate::Calibrate),
     Serve(serve::Serve),
     Work(work::Work),
+    Token(token::Token),
+    Backup(backup::Backup),
+    Restore(backup::Restore),
     Send(send::Send),
     Inspect(inspect::Inspect),
     /// Prints the OpenAPI document of the HTTP interface.
@@ -79,6 +86,9 @@ pub fn run() -> ExitCode {
         Command::Calibrate(command) => command.run(),
         Command::Serve(command) => command.run(),
         Command::Work(command) => command.run(),
+        Command::Token(command) => command.run(),
+        Command::Backup(command) => command.run(),
+        Command::Restore(command) => command.run(),
         Command::Send(command) => command.run(),
         Command::Inspect(command) => command.run(),
         Command::Openapi => print_openapi(),

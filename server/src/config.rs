@@ -1,10 +1,11 @@
 //! Addresses, folders and limits: what the server may use and how long it waits. Flags set some; all have names here.
 
-use std::net::SocketAddr;
+use std::net::{IpAddr, SocketAddr};
 use std::path::{Path, PathBuf};
 use std::time::Duration;
 
 use crate::db::DatabasePlace;
+use crate::retention::Policy;
 use crate::store::StorePlace;
 
 /// Bytes in a GB as the flags count them.
@@ -19,6 +20,10 @@ pub struct Config {
     pub places: Places,
     /// Jobs that run at the same time.
     pub workers: usize,
+    /// Who is let in.
+    pub doors: Doors,
+    /// How long runs are kept.
+    pub retention: Policy,
     /// Limits of requests.
     pub requests: RequestLimits,
     /// Limits of uploads in pieces.
@@ -27,6 +32,17 @@ pub struct Config {
     pub live: LiveLimits,
     /// Limits of jobs.
     pub jobs: JobLimits,
+}
+
+/// Who is let in, and how they come.
+#[derive(Clone, Debug)]
+pub struct Doors {
+    /// False where whoever reaches the loopback may do everything.
+    pub locked: bool,
+    /// Certificate chain and key, PEM files.
+    pub tls: Option<(PathBuf, PathBuf)>,
+    /// Proxies whose `X-Forwarded-…` are believed.
+    pub trusted_proxies: Vec<IpAddr>,
 }
 
 /// Where a process keeps what.
@@ -82,6 +98,13 @@ pub struct RequestLimits {
     pub form_fields: usize,
     /// Uploads at the same time; further ones are asked to come back.
     pub uploads_at_once: usize,
+    /// Room that must stay free on the disk of the process's folder, bytes: below it nothing more is taken in, and no
+    /// job begins.
+    pub disk_reserve_bytes: u64,
+    /// Requests a second of one token or session, on average; further ones are asked to come back.
+    pub per_s: u32,
+    /// As many it may make at once.
+    pub at_once: u32,
     /// Connections at the same time; further ones wait to be accepted.
     pub connections: usize,
     /// How long a client may take to send the head of a request, and to stay connected without one.
@@ -103,6 +126,9 @@ impl Default for RequestLimits {
             small_body_bytes: 256 * 1024,
             form_fields: 32,
             uploads_at_once: 16,
+            disk_reserve_bytes: 2 * GB,
+            per_s: 200,
+            at_once: 2000,
             connections: 1024,
             head_timeout: Duration::from_secs(30),
             sender_silence: Duration::from_secs(60),
@@ -198,6 +224,8 @@ pub struct JobLimits {
     pub retry_base: Duration,
     /// Longest wait between two attempts.
     pub retry_max: Duration,
+    /// Wait of a job whose attempt ended because the records or the store were away.
+    pub postpone: Duration,
     /// How often a worker gives a sign of life.
     pub heartbeat: Duration,
     /// A worker without a sign of life for this long has lost its lease. Measured on the clock of whoever watches,
@@ -244,6 +272,7 @@ impl Default for JobLimits {
             max_losses: 10,
             retry_base: Duration::from_secs(1),
             retry_max: Duration::from_secs(300),
+            postpone: Duration::from_secs(20),
             heartbeat: Duration::from_secs(5),
             lease: Duration::from_secs(60),
             record_patience: Duration::from_secs(3600),

@@ -27,11 +27,19 @@ pub use place::DatabasePlace;
 use crate::error::{Error, Result};
 
 /// The migrations in order; the schema's version is the number of those that ran.
-const MIGRATIONS: [&str; 3] = [
+const MIGRATIONS: [&str; 6] = [
     include_str!("migrations/0001_records.sql"),
     include_str!("migrations/0002_job_order.sql"),
     include_str!("migrations/0003_arrivals.sql"),
+    include_str!("migrations/0004_doors.sql"),
+    include_str!("migrations/0005_batches.sql"),
+    include_str!("migrations/0006_pins.sql"),
 ];
+
+/// The version of the schema that this Stria makes.
+pub fn schema_version() -> i64 {
+    MIGRATIONS.len() as i64
+}
 
 /// Connections kept open: readers do not wait for each other, nor for the writer.
 const MAX_CONNECTIONS: u32 = 8;

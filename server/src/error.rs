@@ -53,6 +53,9 @@ pub enum Error {
     /// All places of a bounded resource are taken.
     #[error("{0}")]
     Busy(String),
+    /// The disk has no room for it.
+    #[error("{0}")]
+    NoRoom(String),
     /// The request comes from a page of another origin or under a foreign host name.
     #[error("{0}")]
     Foreign(String),
@@ -92,6 +95,7 @@ impl Error {
     /// True where the disk (or a quota) is full.
     pub fn is_storage_full(&self) -> bool {
         match self {
+            Error::NoRoom(_) => true,
             Error::Io { source, .. } => is_full(source),
             Error::Store(e) => chain_is_full(e),
             // SQLite's own words for SQLITE_FULL; the driver passes no kind through.

@@ -2,7 +2,10 @@
 //!
 //! Handlers meet the workers only in the records, the queue and the store.
 
+mod batches;
 pub mod connection;
+mod document;
+mod doors;
 mod events;
 mod extract;
 mod files;
@@ -15,16 +18,22 @@ mod jobs;
 mod lists;
 mod live;
 mod measure;
+mod metrics;
 mod page;
 mod problem;
 mod recording;
+mod retention;
 mod rigs;
 mod runs;
+mod session;
 mod squeeze;
 mod stored;
+mod tokens;
 mod uploads;
 
 use std::sync::Arc;
+
+pub use doors::Rates;
 
 use axum::http::Uri;
 use axum::response::Json;
@@ -37,7 +46,10 @@ use utoipa::OpenApi;
 use utoipa_axum::router::OpenApiRouter;
 use utoipa_axum::routes;
 
+use crate::auth::Auth;
+use crate::batches::Batches;
 use crate::config::Config;
+use crate::disk::DiskGuard;
 use crate::error::Error;
 use crate::live::Live;
 use crate::queue::Queue;
@@ -48,10 +60,16 @@ use crate::uploads::Uploads;
 /// What every handler may use.
 #[derive(Clone)]
 pub struct App {
+    /// Who may come in.
+    pub auth: Auth,
+    /// How often.
+    pub rates: Arc<Rates>,
     /// The records.
     pub runs: Runs,
     /// The jobs.
     pub queue: Queue,
+    /// Reprocessing in bulk.
+    pub batches: Batches,
     /// The files.
     pub store: Store,
     /// Limits and folders.
@@ -62,6 +80,8 @@ pub struct App {
     pub live: Live,
     /// One permit per live stream that may be open at the same time.
     pub streams: Arc<Semaphore>,
+    /// Room on the disk.
+    pub disk: DiskGuard,
     /// One permit per upload that may come in at the same time.
     pub arrivals: Arc<Semaphore>,
     /// The server shall stop: streams end.
@@ -110,8 +130,22 @@ fn routes() -> OpenApiRouter<App> {
         .routes(routes!(lists::list_recipes))
         .routes(routes!(lists::list_options))
         .routes(routes!(lists::list_workers))
+        .routes(routes!(retention::preview_retention))
+        .routes(routes!(retention::get_pin, retention::pin_run, retention::unpin_run))
+        .routes(routes!(batches::list_batches, batches::create_batch))
+        .routes(routes!(batches::get_batch))
+        .routes(routes!(batches::list_results))
+        .routes(routes!(batches::pause_batch))
+        .routes(routes!(batches::resume_batch))
+        .routes(routes!(batches::cancel_batch))
+        .routes(routes!(session::get_session, session::create_session, session::delete_session))
+        .routes(routes!(tokens::list_tokens, tokens::create_token))
+        .routes(routes!(tokens::revoke_token))
+        .routes(routes!(tokens::rotate_token))
+        .routes(routes!(tokens::list_audit))
         .routes(routes!(health::get_livez))
         .routes(routes!(health::get_readyz))
+        .routes(routes!(metrics::get_metrics))
 }
 
 /// Uploads in pieces speak tus, in every answer.
@@ -134,6 +168,7 @@ pub fn openapi() -> utoipa::openapi::OpenApi {
     // The router's way to say "the rest of the path" is not OpenAPI's.
     let paths = std::mem::take(&mut document.paths.paths);
     document.paths.paths = paths.into_iter().map(|(path, item)| (path.replace("{*", "{"), item)).collect();
+    document::add_doors(&mut document);
     document
 }
 
@@ -146,12 +181,15 @@ pub fn router(app: App) -> Router {
         .route("/api", axum::routing::any(unknown))
         .route("/api/", axum::routing::any(unknown))
         .route("/api/{*rest}", axum::routing::any(unknown))
+        .route("/login", get(session::get_login).post(session::post_login))
         .merge(page::routes())
         .method_not_allowed_fallback(wrong_method)
         .layer(middleware::from_fn(squeeze::squeeze_json))
         .layer(middleware::from_fn_with_state(app.clone(), guard::answer_in_time))
+        .layer(middleware::from_fn_with_state(app.clone(), doors::guard))
         .layer(middleware::from_fn_with_state(app.clone(), guard::own_origin_only))
         .layer(middleware::map_response(guard::safe_headers))
+        .layer(middleware::from_fn(guard::named))
         .layer(CatchPanicLayer::custom(problem::after_panic))
         .layer(axum::extract::DefaultBodyLimit::max(limits.small_body_bytes))
         .with_state(app)

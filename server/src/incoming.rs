@@ -10,6 +10,7 @@ use tokio::sync::mpsc;
 use tokio::task::JoinHandle;
 
 use crate::error::{Error, Result};
+use crate::metrics::metrics;
 use crate::store::{Facts, hex};
 
 /// Chunks that may wait for the disk.
@@ -45,6 +46,7 @@ impl Receiver {
     /// Takes a chunk; waits for the disk.
     pub async fn push(&mut self, chunk: Bytes) -> Result<()> {
         self.received_bytes += chunk.len() as u64;
+        metrics().bytes_in.inc_by(chunk.len() as u64);
         if self.received_bytes > self.limit_bytes {
             return Err(Error::TooLarge { limit_bytes: self.limit_bytes });
         }

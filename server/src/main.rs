@@ -3,13 +3,18 @@
 //! Who may know whom: `http/*` and `worker` never import each other; they meet in the records (`runs`, `db`), the
 //! `queue` and the `store`. Only the `process` command runs the pipeline; workers start it as a child process.
 
+pub mod auth;
+pub mod backup;
+pub mod batches;
 pub mod cli;
 pub mod config;
 pub mod db;
+pub mod disk;
 pub mod error;
 pub mod http;
 pub mod incoming;
 pub mod live;
+pub mod metrics;
 pub mod mjpeg;
 pub mod queue;
 pub mod resumed_hash;

@@ -7,6 +7,7 @@
 
 mod lease;
 mod lost;
+mod stats;
 
 use sea_orm::sea_query::{Expr, LockBehavior, LockType, OnConflict};
 use sea_orm::{
@@ -17,11 +18,13 @@ use uuid::Uuid;
 
 pub use lease::{Lease, Outcome, Progress, PublishedProduct, Signal};
 pub use lost::LeaseWatch;
+pub use stats::QueueDepth;
 
 use crate::config::JobLimits;
-use crate::db::tables::{job, run, segment, unpublished};
+use crate::db::tables::{batch, job, run, segment, unpublished};
 use crate::db::{ANSWER_PATIENCE, Db, retried};
 use crate::error::{Error, Result};
+use crate::metrics::metrics;
 use crate::store;
 use crate::wire::time::now_ms;
 use crate::wire::{JobState, Priority};
@@ -102,6 +105,67 @@ pub struct NewJob {
     pub recipe_toml: String,
 }
 
+/// Where a job of a batch comes from.
+pub struct Origin {
+    /// The batch.
+    pub batch: String,
+    /// The run's latest job before it.
+    pub base_job: String,
+}
+
+/// The row of a batch's new job. It gets its rig and recipe when it is claimed.
+pub fn new_row(run: &str, priority: Priority, origin: Origin) -> job::ActiveModel {
+    let new = NewJob {
+        run: run.into(),
+        priority,
+        rig_name: String::new(),
+        rig_toml: String::new(),
+        recipe_name: String::new(),
+        recipe_toml: String::new(),
+    };
+    row_of(Queue::new_id(), new, Some(origin))
+}
+
+fn row_of(id: String, new: NewJob, origin: Option<Origin>) -> job::ActiveModel {
+    let now = now_ms();
+    let (batch, base_job) = origin.map(|o| (o.batch, o.base_job)).unzip();
+    job::ActiveModel {
+        id: Set(id),
+        run_id: Set(new.run),
+        created_ms: Set(now),
+        priority: Set(new.priority.as_str().into()),
+        rank_ms: Set(rank_ms(now, new.priority)),
+        rig_name: Set(new.rig_name),
+        rig_toml: Set(new.rig_toml),
+        recipe_name: Set(new.recipe_name),
+        recipe_toml: Set(new.recipe_toml),
+        state: Set(JobState::Queued.as_str().into()),
+        cancel_requested: Set(0),
+        not_before_ms: Set(0),
+        fence: Set(0),
+        attempt: Set(0),
+        failures: Set(0),
+        losses: Set(0),
+        node: Set(String::new()),
+        worker: Set(String::new()),
+        beat: Set(0),
+        stage: Set(String::new()),
+        fraction: Set(0.0),
+        frames: Set(0),
+        frames_total: Set(None),
+        frames_per_s: Set(0.0),
+        time_left_s: Set(None),
+        warnings: Set("[]".into()),
+        error: Set(None),
+        quality: Set(None),
+        result_fence: Set(None),
+        started_ms: Set(None),
+        finished_ms: Set(None),
+        batch_id: Set(batch),
+        base_job: Set(base_job),
+    }
+}
+
 /// The jobs.
 #[derive(Clone)]
 pub struct Queue {
@@ -128,45 +192,13 @@ impl Queue {
 
     /// Adds a job inside the caller's transaction; the caller rings the bell after its commit.
     pub async fn enqueue(&self, records: &impl ConnectionTrait, new: NewJob) -> Result<String> {
-        let (id, now) = (Queue::new_id(), now_ms());
-        let row = job::ActiveModel {
-            id: Set(id.clone()),
-            run_id: Set(new.run.clone()),
-            created_ms: Set(now),
-            priority: Set(new.priority.as_str().into()),
-            rank_ms: Set(rank_ms(now, new.priority)),
-            rig_name: Set(new.rig_name),
-            rig_toml: Set(new.rig_toml),
-            recipe_name: Set(new.recipe_name),
-            recipe_toml: Set(new.recipe_toml),
-            state: Set(JobState::Queued.as_str().into()),
-            cancel_requested: Set(0),
-            not_before_ms: Set(0),
-            fence: Set(0),
-            attempt: Set(0),
-            failures: Set(0),
-            losses: Set(0),
-            node: Set(String::new()),
-            worker: Set(String::new()),
-            beat: Set(0),
-            stage: Set(String::new()),
-            fraction: Set(0.0),
-            frames: Set(0),
-            frames_total: Set(None),
-            frames_per_s: Set(0.0),
-            time_left_s: Set(None),
-            warnings: Set("[]".into()),
-            error: Set(None),
-            quality: Set(None),
-            result_fence: Set(None),
-            started_ms: Set(None),
-            finished_ms: Set(None),
-        };
+        let (id, run) = (Queue::new_id(), new.run.clone());
+        let row = row_of(id.clone(), new, None);
         job::Entity::insert(row).exec_without_returning(records).await?;
         run::Entity::update_many()
             .col_expr(run::Column::LatestJob, Expr::value(id.as_str()))
             .col_expr(run::Column::State, Expr::value(JobState::Queued.as_str()))
-            .filter(run::Column::Id.eq(new.run))
+            .filter(run::Column::Id.eq(run))
             .exec(records)
             .await?;
         Ok(id)
@@ -187,10 +219,15 @@ impl Queue {
         let Some(run) = run::Entity::find_by_id(&next.run_id).one(&*t).await? else {
             return Err(Error::Internal(format!("job {} has no run", next.id)));
         };
+        let next = with_rig_and_recipe(&*t, next).await?;
         let (fence, attempt) = (next.fence + 1, next.attempt + 1);
         job::Entity::update_many()
             .set(job::ActiveModel {
                 state: Set(JobState::Running.as_str().into()),
+                rig_name: Set(next.rig_name.clone()),
+                rig_toml: Set(next.rig_toml.clone()),
+                recipe_name: Set(next.recipe_name.clone()),
+                recipe_toml: Set(next.recipe_toml.clone()),
                 fence: Set(fence),
                 attempt: Set(attempt),
                 node: Set(node.into()),
@@ -217,6 +254,9 @@ impl Queue {
         repeat_in_run(&*t, &next.id, JobState::Running).await?;
         t.commit().await?;
         self.bell.ring();
+        if next.attempt == 0 {
+            metrics().wait_s.observe((now_ms() - next.created_ms).max(0) as f64 / 1000.0);
+        }
         Ok(Some(Lease::new(next, run, fence, attempt)))
     }
 
@@ -253,7 +293,7 @@ impl Queue {
         let t = self.db.write().await?;
         let found = find_to_change(&*t, id).await?;
         match state_of(&found)? {
-            JobState::Queued => {
+            JobState::Queued | JobState::Paused => {
                 let change = job::ActiveModel {
                     state: Set(JobState::Cancelled.as_str().into()),
                     finished_ms: Set(Some(now_ms())),
@@ -322,6 +362,26 @@ pub async fn mark_unpublished(records: &impl ConnectionTrait, prefix: String, du
     Ok(())
 }
 
+/// A batch's job gets what its batch says, or else what its run's job before it had.
+async fn with_rig_and_recipe(records: &impl ConnectionTrait, mut job: job::Model) -> Result<job::Model> {
+    let Some(batch) = &job.batch_id else { return Ok(job) };
+    if !job.rig_toml.is_empty() && !job.recipe_toml.is_empty() {
+        return Ok(job);
+    }
+    let missing = |what: &str| Error::Internal(format!("job {} of batch {batch} has no {what}", job.id));
+    let batch = batch::Entity::find_by_id(batch).one(records).await?.ok_or_else(|| missing("batch"))?;
+    let base = match &job.base_job {
+        Some(id) => job::Entity::find_by_id(id).one(records).await?,
+        None => None,
+    };
+    let base = base.ok_or_else(|| missing("job before it"))?;
+    job.rig_name = batch.rig_name.unwrap_or(base.rig_name);
+    job.rig_toml = batch.rig_toml.unwrap_or(base.rig_toml);
+    job.recipe_name = batch.recipe_name.unwrap_or(base.recipe_name);
+    job.recipe_toml = batch.recipe_toml.unwrap_or(base.recipe_toml);
+    Ok(job)
+}
+
 /// A job, held until the end of the transaction.
 async fn find_to_change(records: &impl ConnectionTrait, id: &str) -> Result<job::Model> {
     let found = job::Entity::find_by_id(id).lock_exclusive().one(records).await?;
@@ -337,5 +397,9 @@ async fn repeat_in_run(records: &impl ConnectionTrait, job: &str, state: JobStat
     Ok(())
 }
 
+#[cfg(test)]
+mod model;
+#[cfg(test)]
+mod scale;
 #[cfg(test)]
 mod tests;

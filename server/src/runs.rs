@@ -14,11 +14,12 @@ pub use jobs::content_type;
 pub use listing::{Page, RunFilter, RunSort};
 pub use rigs::{RecipeText, RigText, built_in_recipes, options};
 
-use crate::db::tables::{asset, idempotency_key, job, log_line, product, run, segment, unpublished};
+use crate::db::tables::{asset, idempotency_key, job, log_line, pin, product, run, segment, unpublished};
 use crate::db::{ANSWER_PATIENCE, Db, retried};
 use crate::error::{Error, Result};
 use crate::incoming::Incoming;
 use crate::queue::{self, NewJob, Queue};
+use crate::retention::{self, Policy};
 use crate::source;
 use crate::store::{self, Facts, Key, Store};
 use crate::wire::time::{from_text, now_ms, to_text};
@@ -406,6 +407,22 @@ impl Runs {
         Ok(())
     }
 
+    /// What a policy would delete now.
+    pub async fn preview(&self, policy: &Policy) -> Result<wire::RetentionPreview> {
+        policy.preview(&self.db).await
+    }
+
+    /// Keeps a run whatever the policy says, or not.
+    pub async fn pin(&self, id: &str, pinned: bool) -> Result<()> {
+        retried(ANSWER_PATIENCE, || retention::set_pin(&self.db, id, pinned)).await
+    }
+
+    /// Whether a run is pinned.
+    pub async fn is_pinned(&self, id: &str) -> Result<bool> {
+        self.row(self.db.read(), id).await?;
+        Ok(pin::Entity::find_by_id(id).one(self.db.read()).await?.is_some())
+    }
+
     async fn forget_asset_without_runs(&self, records: &impl ConnectionTrait, name: &str) -> Result<()> {
         let left = run::Entity::find().filter(run::Column::Asset.eq(name)).one(records).await?;
         if left.is_none() {
@@ -481,7 +498,7 @@ fn check_chainage(chainage_mm: f64) -> Result<()> {
     ))
 }
 
-fn check_note(note: &str) -> Result<()> {
+pub(crate) fn check_note(note: &str) -> Result<()> {
     if note.chars().count() <= MAX_NOTE_CHARS {
         return Ok(());
     }

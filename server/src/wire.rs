@@ -2,14 +2,19 @@
 //!
 //! Core's types never cross the HTTP wire directly; the OpenAPI document is generated from these.
 
+mod batch;
 pub mod child;
+mod doors;
 mod job;
 mod lists;
 mod live;
 mod measure;
+mod retention;
 mod run;
 pub mod time;
 
+pub use batch::{Batch, BatchFilter, BatchPage, BatchPreview, BatchResult, BatchResultPage, BatchState, BatchWish};
+pub use doors::{AuditLine, AuditPage, LogIn, Rotation, Session, Token, TokenPage, TokenWish, TokenWithSecret};
 pub use job::{Job, JobState, LogLine, Priority, Product, Recording, RecordingSegment, Reprocess};
 pub use lists::{
     Asset, AssetPage, Health, JobPage, LogPage, OptionRange, ProductPage, Recipe, RecipeOption, Rig, RigPage, RunPage,
@@ -17,6 +22,7 @@ pub use lists::{
 };
 pub use live::{LiveEnded, LiveStream, LiveStreams};
 pub use measure::{CrossSection, Trajectory};
+pub use retention::{Doomed, Pin, RetentionPreview};
 pub use run::{Direction, Run, RunChange, RunSource};
 
 use serde::{Deserialize, Serialize};

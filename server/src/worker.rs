@@ -5,10 +5,13 @@
 
 mod attempt;
 mod child;
+mod confinement;
 mod follow;
 mod publish;
 mod scratch;
 mod showcase;
+
+pub use confinement::Confinement;
 
 use std::path::PathBuf;
 use std::time::Duration;
@@ -20,6 +23,7 @@ use tokio_util::sync::CancellationToken;
 use crate::config::JobLimits;
 use crate::db::tables::worker;
 use crate::db::{ANSWER_PATIENCE, Db, retried};
+use crate::disk::DiskGuard;
 use crate::error::Result;
 use crate::queue::{LeaseWatch, Queue, Wanted};
 use crate::store::Store;
@@ -27,6 +31,9 @@ use crate::wire::time::now_ms;
 
 /// Longest wait of an idle worker before it looks for jobs that another process enqueued, or whose wait is over.
 const LOOK_EVERY: Duration = Duration::from_secs(1);
+
+/// How long a worker without room on its disk waits before it looks again.
+const DISK_PAUSE: Duration = Duration::from_secs(10);
 
 /// How often a worker process says that it is there.
 const SEEN_EVERY: Duration = Duration::from_secs(10);
@@ -47,12 +54,16 @@ pub struct Worker {
     pub limits: JobLimits,
     /// The binary that processes: this one.
     pub program: PathBuf,
+    /// How the child is kept from the network.
+    pub confined: Confinement,
     /// Where attempts write.
     pub scratch: PathBuf,
     /// The name of this machine's data folder, the same after a restart.
     pub node: String,
     /// The name of this process.
     pub name: String,
+    /// Room on the disk of the scratch space.
+    pub disk: DiskGuard,
     /// Stop: give the jobs back.
     pub stop: CancellationToken,
 }
@@ -95,6 +106,11 @@ impl Worker {
         let mut changes = self.queue.bell().listen();
         while !self.stop.is_cancelled() {
             changes.borrow_and_update();
+            if let Some(lack) = self.disk.lack() {
+                tracing::warn!(lack, "no job begins");
+                pause(&self.stop, DISK_PAUSE).await;
+                continue;
+            }
             match self.queue.claim(which, &self.node, &self.name).await {
                 Ok(Some(lease)) => {
                     attempt::run(&self, &lease).await;

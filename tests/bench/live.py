@@ -89,7 +89,7 @@ def main():
         images, rig = simulate(folder)
         walk = repeat(images, frames, folder / "walk")
         server = subprocess.Popen(
-            [STRIA, "serve", "--listen", "127.0.0.1:0", "--data", folder / "data", "--workers", "1"],
+            [STRIA, "serve", "--listen", "127.0.0.1:0", "--data", folder / "data", "--workers", "1", "--without-authentication"],
             stdout=subprocess.PIPE, text=True,
         )
         try:

@@ -27,7 +27,7 @@ export async function startServer(flags = []) {
   need(stria, "run `make build`, or set STRIA_BIN");
   const folder = await mkdtemp(path.join(tmpdir(), "stria-browser-"));
   const url = `http://127.0.0.1:${await freePort()}`;
-  const child = spawn(stria, ["serve", "--listen", new URL(url).host, "--data", path.join(folder, "data"), ...flags], { stdio: ["ignore", "pipe", "pipe"] });
+  const child = spawn(stria, ["serve", "--listen", new URL(url).host, "--data", path.join(folder, "data"), "--without-authentication", ...flags], { stdio: ["ignore", "pipe", "pipe"] });
   let said = "";
   for (const stream of [child.stdout, child.stderr]) stream.on("data", (bytes) => (said += bytes));
   const ended = new Promise((done) => child.once("exit", (code, signal) => done(signal ?? code)));

@@ -114,3 +114,35 @@ fn work_says_what_it_needs() {
         assert!(said.contains(expected), "{arguments:?}: {said}");
     }
 }
+
+#[test]
+fn an_upload_begun_on_one_server_ends_on_the_other() {
+    use base64::Engine;
+    let cluster = Cluster::start();
+    let (a, b) = (cluster.server(&["--workers", "0"]), cluster.server(&["--workers", "0"]));
+    let _worker = cluster.worker(&["--slots", "1"]);
+    let video = short_run().video_bytes();
+    let coded = |text: &str| base64::prelude::BASE64_STANDARD.encode(text);
+    let metadata =
+        format!("filename {},asset {},rig {}", coded("video.mp4"), coded("Wall"), coded(&short_run().rig_text()));
+    let made = a.post("/api/uploads").header("Tus-Resumable", "1.0.0").header("Upload-Length", video.len().to_string());
+    let made = send(made.header("Upload-Metadata", metadata));
+    assert_eq!(made.status(), 201);
+    let location = header(&made, "location");
+    let path = location.strip_prefix(&a.url("")).unwrap_or(&location).to_string();
+    let piece = |server: &Server, from: usize, to: usize| {
+        let request = server.patch(&path).header("Tus-Resumable", "1.0.0").header("Upload-Offset", from.to_string());
+        send(request.header("Content-Type", "application/offset+octet-stream").body(video[from..to].to_vec()))
+    };
+    let half = video.len() / 2;
+    assert_eq!(header(&piece(&a, 0, half), "upload-offset"), half.to_string());
+    let seen = send(b.head(&path).header("Tus-Resumable", "1.0.0"));
+    assert_eq!(header(&seen, "upload-offset"), half.to_string(), "the other server knows where to go on");
+    let whole = piece(&b, half, video.len());
+    assert_eq!(whole.status(), 204);
+    let (run, job) = (header(&whole, "stria-run"), header(&whole, "stria-job"));
+    a.wait_for_state(&job, "done");
+    assert_products_whole(&a, &job);
+    let source = send(a.get(&format!("/api/runs/{run}/source"))).bytes().expect("a body");
+    assert!(source == video, "byte for byte");
+}

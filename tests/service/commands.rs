@@ -149,7 +149,7 @@ fn send_waits_for_the_result_and_passes_on_what_went_wrong() {
         (vec!["--rig", "unknown"], 2, "no stored rig"),
         (vec!["--rig", "missing.toml"], 2, "missing.toml"),
         (vec!["--rig", rig, "--recipe", "fast"], 2, "paper"),
-        (vec!["--rig", rig, "--server", "https://127.0.0.1:1"], 2, "http://"),
+        (vec!["--rig", rig, "--server", "ftp://127.0.0.1:1"], 2, "https://"),
     ] {
         let failed = if more.contains(&"--server") {
             run_stria(&[&["send", video, "--asset", "Wall"][..], more.as_slice()].concat())
@@ -180,8 +180,10 @@ fn serve_refuses_what_would_do_harm() {
     let url = server.url("");
     let taken = url.trim_start_matches("http://");
     for (arguments, expected) in [
-        (vec!["--listen", "0.0.0.0:0"], "--without-authentication"),
-        (vec!["--listen", "[::]:0"], "--without-authentication"),
+        (vec!["--listen", "0.0.0.0:0", "--without-authentication"], "127.0.0.1"),
+        (vec!["--listen", "[::]:0", "--without-authentication"], "127.0.0.1"),
+        (vec!["--tls-cert", "missing.pem"], "--tls-key"),
+        (vec!["--tls-cert", "missing.pem", "--tls-key", "missing.pem"], "missing.pem"),
         (vec!["--listen", "nowhere"], "--listen"),
         (vec!["--max-upload-gb", "0"], "max-upload-gb"),
         (vec!["--workers", "100000"], "1024"),

@@ -103,4 +103,43 @@ fn a_job_that_takes_too_long_or_too_much_fails_with_the_reason() {
     let job = text(&server.upload(long_run(), "Wall"), "/job/id");
     let failed = server.wait_for_state(&job, "failed");
     assert_eq!(failed["attempt"], 3, "it may have been another's memory: {failed:#}");
+    assert_eq!(text(&failed, "/error/type"), "urn:stria:job:out_of_memory");
+    assert!(text(&failed, "/error/detail").contains("0.02 GB"), "the limit is named: {failed:#}");
+}
+
+#[test]
+fn a_job_whose_process_always_dies_ends_with_the_reason() {
+    let server = Server::start(&["--workers", "1"]);
+    let job = text(&server.upload(long_run(), "Wall"), "/job/id");
+    let mut killed = Vec::new();
+    let failed = loop {
+        let now = server.json(&format!("/api/jobs/{job}"));
+        if now["state"] == "failed" {
+            break now;
+        }
+        assert!(matches!(now["state"].as_str(), Some("queued" | "running")), "{now:#}");
+        for child in server.children().into_iter().filter(|child| !killed.contains(child)).collect::<Vec<_>>() {
+            signal("SEGV", child);
+            killed.push(child);
+        }
+        std::thread::sleep(Duration::from_millis(10));
+    };
+    assert_eq!(failed["attempt"], 3, "{failed:#}");
+    assert_eq!(text(&failed, "/error/type"), "urn:stria:job:killed");
+    assert!(text(&failed, "/error/detail").contains("signal 11 (SIGSEGV)"), "{failed:#}");
+    assert_eq!(failed["error"]["retryable"], false);
+}
+
+#[test]
+fn a_job_that_always_takes_its_worker_along_ends_with_the_reason() {
+    let mut server = Server::start(&["--workers", "1", "--max-losses", "2"]);
+    let job = text(&server.upload(long_run(), "Wall"), "/job/id");
+    for attempt in 1..=2 {
+        server.wait_for(&job, "at work", |j| j["state"] == "running" && j["attempt"] == attempt);
+        server.kill();
+        server.start_again();
+    }
+    let failed = server.wait_for_state(&job, "failed");
+    assert_eq!(text(&failed, "/error/type"), "urn:stria:job:lost");
+    assert!(text(&failed, "/error/detail").contains("2 of at most 2"), "{failed:#}");
 }

@@ -31,7 +31,8 @@ impl Cluster {
         Cluster { postgres, s3: S3::start(), database }
     }
 
-    fn places(&self) -> Vec<String> {
+    /// The flags under which programs find both.
+    pub fn places(&self) -> Vec<String> {
         let store = format!("s3://{BUCKET}/site/a");
         ["--database", &self.database, "--store", &store].map(String::from).to_vec()
     }

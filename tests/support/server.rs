@@ -3,6 +3,7 @@
 use std::io::{BufRead, BufReader};
 use std::path::{Path, PathBuf};
 use std::process::{Child, Command, ExitStatus, Stdio};
+use std::sync::{Arc, Mutex};
 use std::time::{Duration, Instant};
 
 use reqwest::blocking::{Client, RequestBuilder, Response};
@@ -21,11 +22,13 @@ pub struct Server {
     variables: Vec<(String, String)>,
     process: Option<Child>,
     url: String,
+    said: Arc<Mutex<Vec<String>>>,
+    token: Option<String>,
     client: Client,
 }
 
 impl Server {
-    /// Starts one on a new folder.
+    /// Starts one on a new folder; it asks nobody for a token.
     ///
     /// # Panics
     /// Where it does not become ready.
@@ -33,22 +36,54 @@ impl Server {
         Server::start_with(flags, &[])
     }
 
+    /// Starts one on a new folder, as it is without any flag: with its doors locked.
+    ///
+    /// # Panics
+    /// Where it does not become ready.
+    pub fn start_locked(flags: &[&str]) -> Server {
+        Server::start_any(flags, &[])
+    }
+
     /// Starts one on a new folder, with variables in its environment.
     ///
     /// # Panics
     /// Where it does not become ready.
     pub fn start_with(flags: &[&str], variables: &[(String, String)]) -> Server {
-        let client = Client::builder().timeout(PATIENCE).build().expect("a client");
-        let mut server = Server {
+        let flags: Vec<&str> = flags.iter().copied().chain(["--without-authentication"]).collect();
+        Server::start_any(&flags, variables)
+    }
+
+    /// One on a new folder that was not started yet.
+    ///
+    /// # Panics
+    /// Where there is no place for it.
+    pub fn stopped(flags: &[&str]) -> Server {
+        let flags: Vec<&str> = flags.iter().copied().chain(["--without-authentication"]).collect();
+        Server::new(&flags, &[])
+    }
+
+    fn start_any(flags: &[&str], variables: &[(String, String)]) -> Server {
+        let mut server = Server::new(flags, variables);
+        server.start_again();
+        server
+    }
+
+    fn new(flags: &[&str], variables: &[(String, String)]) -> Server {
+        Server {
             data: tempfile::tempdir().expect("a temporary folder"),
             flags: flags.iter().map(ToString::to_string).collect(),
             variables: variables.to_vec(),
             process: None,
             url: String::new(),
-            client,
-        };
-        server.start_again();
-        server
+            said: Arc::default(),
+            token: None,
+            client: Client::builder().timeout(PATIENCE).build().expect("a client"),
+        }
+    }
+
+    /// Flags for the next start.
+    pub fn add_flags(&mut self, flags: &[&str]) {
+        self.flags.extend(flags.iter().map(ToString::to_string));
     }
 
     /// Starts it (again) on its folder; its port is another each time, unless a flag says which.
@@ -69,11 +104,40 @@ impl Server {
             .spawn()
             .expect("the server starts");
         let stdout = process.stdout.take().expect("piped");
+        let mut stdout = BufReader::new(stdout);
         let mut line = String::new();
-        BufReader::new(stdout).read_line(&mut line).expect("stdout is text");
-        let url = line.split_whitespace().find(|word| word.starts_with("http://"));
+        stdout.read_line(&mut line).expect("stdout is text");
+        let url = line.split_whitespace().find(|word| word.starts_with("http"));
         self.url = url.unwrap_or_else(|| panic!("no address in {line:?}")).trim_end_matches('/').to_string();
+        let said = Arc::new(Mutex::new(Vec::new()));
+        self.said = said.clone();
+        std::thread::spawn(move || {
+            for line in stdout.lines().map_while(Result::ok) {
+                said.lock().expect("no one panics here").push(line);
+            }
+        });
         self.process = Some(process);
+    }
+
+    /// What it printed after its address, a moment after it was ready.
+    ///
+    /// # Panics
+    /// Where its reader did.
+    pub fn said(&self) -> Vec<String> {
+        std::thread::sleep(Duration::from_millis(500));
+        self.said.lock().expect("no one panics here").clone()
+    }
+
+    /// From now on all requests carry this token.
+    pub fn use_token(&mut self, token: &str) {
+        self.token = Some(token.into());
+    }
+
+    fn with_token(&self, request: RequestBuilder) -> RequestBuilder {
+        match &self.token {
+            Some(token) => request.bearer_auth(token),
+            None => request,
+        }
     }
 
     /// Its data folder.
@@ -88,27 +152,32 @@ impl Server {
 
     /// A request.
     pub fn get(&self, path: &str) -> RequestBuilder {
-        self.client.get(self.url(path))
+        self.with_token(self.client.get(self.url(path)))
     }
 
     /// A request.
     pub fn head(&self, path: &str) -> RequestBuilder {
-        self.client.head(self.url(path))
+        self.with_token(self.client.head(self.url(path)))
     }
 
     /// A request.
     pub fn post(&self, path: &str) -> RequestBuilder {
-        self.client.post(self.url(path))
+        self.with_token(self.client.post(self.url(path)))
+    }
+
+    /// A request.
+    pub fn put(&self, path: &str) -> RequestBuilder {
+        self.with_token(self.client.put(self.url(path)))
     }
 
     /// A request.
     pub fn patch(&self, path: &str) -> RequestBuilder {
-        self.client.patch(self.url(path))
+        self.with_token(self.client.patch(self.url(path)))
     }
 
     /// A request.
     pub fn delete(&self, path: &str) -> RequestBuilder {
-        self.client.delete(self.url(path))
+        self.with_token(self.client.delete(self.url(path)))
     }
 
     /// The JSON of a path.

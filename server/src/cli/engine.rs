@@ -11,10 +11,11 @@ use tokio_util::sync::CancellationToken;
 use super::Failed;
 use crate::config::{GB, JobLimits, Places};
 use crate::db::{DatabasePlace, Db};
+use crate::disk::DiskGuard;
 use crate::error::{Error, Result};
 use crate::queue::Queue;
 use crate::store::{Store, StorePlace};
-use crate::worker::Worker;
+use crate::worker::{Confinement, Worker};
 
 /// Most jobs of one process at the same time.
 const MOST_SLOTS: usize = 1024;
@@ -23,11 +24,11 @@ const MOST_SLOTS: usize = 1024;
 #[derive(Args)]
 pub(super) struct PlaceArgs {
     /// The records: postgres://USER:PASSWORD@HOST/NAME, or sqlite:PATH [default: stria.db in --data]
-    #[arg(long, value_name = "URL", env = "STRIA_DATABASE", hide_env_values = true)]
+    #[arg(long, value_name = "URL", env = "STRIA_DATABASE", hide_env_values = true, global = true)]
     database: Option<String>,
     /// The files: a folder, or s3://BUCKET/PREFIX with AWS_ACCESS_KEY_ID, AWS_SECRET_ACCESS_KEY, AWS_REGION,
     /// AWS_ENDPOINT, AWS_ALLOW_HTTP [default: store in --data]
-    #[arg(long, value_name = "URL", env = "STRIA_STORE")]
+    #[arg(long, value_name = "URL", env = "STRIA_STORE", global = true)]
     store: Option<String>,
 }
 
@@ -61,9 +62,20 @@ pub(super) struct JobArgs {
     #[arg(long, value_name = "N", default_value_t = 10, env = "STRIA_MAX_LOSSES",
         value_parser = clap::value_parser!(i32).range(1..=1000))]
     max_losses: i32,
+    /// Room that stays free on the disk of --data, GB: below it nothing is taken in and no job begins
+    #[arg(long, value_name = "GB", default_value_t = 2.0, env = "STRIA_DISK_RESERVE_GB")]
+    disk_reserve_gb: f64,
 }
 
 impl JobArgs {
+    /// The reserve on the disk, bytes.
+    pub(super) fn disk_reserve_bytes(&self) -> std::result::Result<u64, Failed> {
+        match self.disk_reserve_gb {
+            0.0 => Ok(0),
+            gb => Ok((positive("--disk-reserve-gb", gb, 1e6, "GB")? * GB as f64) as u64),
+        }
+    }
+
     /// Checked.
     pub(super) fn limits(&self) -> std::result::Result<JobLimits, Failed> {
         let time_limit = positive("--job-time-limit-h", self.job_time_limit_h, 1e5, "h")? * 3600.0;
@@ -136,6 +148,7 @@ pub(super) struct Engine {
     pub(super) db: Db,
     pub(super) queue: Queue,
     pub(super) store: Store,
+    pub(super) disk: DiskGuard,
     limits: JobLimits,
     places: Places,
     _lock: File,
@@ -143,16 +156,17 @@ pub(super) struct Engine {
 
 impl Engine {
     /// Makes the folders, takes the lock, opens records and store.
-    pub(super) async fn start(places: &Places, limits: &JobLimits) -> Result<Engine> {
+    pub(super) async fn start(places: &Places, limits: &JobLimits, reserve_bytes: u64) -> Result<Engine> {
         let lock = lock_folder(places)?;
         let db = Db::open(&places.database).await?;
         let queue = Queue::new(db.clone(), limits.clone());
         let store = Store::open(&places.store)?;
-        Ok(Engine { db, queue, store, limits: limits.clone(), places: places.clone(), _lock: lock })
+        let disk = DiskGuard::new(&places.folder, reserve_bytes);
+        Ok(Engine { db, queue, store, disk, limits: limits.clone(), places: places.clone(), _lock: lock })
     }
 
     /// The worker of this process.
-    pub(super) fn worker(&self, stop: &CancellationToken) -> Result<Worker> {
+    pub(super) async fn worker(&self, stop: &CancellationToken) -> Result<Worker> {
         let program = std::env::current_exe().map_err(|e| Error::io("the path of this program", e))?;
         let scratch = self.places.scratch();
         let node = node_name(&self.places.node())?;
@@ -162,9 +176,11 @@ impl Engine {
             store: self.store.clone(),
             limits: self.limits.clone(),
             program,
+            confined: Confinement::find().await,
             scratch: std::path::absolute(&scratch).map_err(|e| Error::io(scratch, e))?,
             name: format!("{}-{}-{}", machine_name(), node.get(..8).unwrap_or(&node), std::process::id()),
             node,
+            disk: self.disk.clone(),
             stop: stop.clone(),
         })
     }
@@ -219,14 +235,4 @@ pub(super) fn block_on<T>(
     // Reads of stdin and the like may never end; they must not keep a stopped process alive.
     runtime.shutdown_timeout(Duration::from_secs(1));
     done
-}
-
-pub(super) fn log_to_stderr() {
-    use std::io::IsTerminal;
-    use tracing_subscriber::EnvFilter;
-    let filter = EnvFilter::try_from_env("STRIA_LOG").unwrap_or_else(|_| EnvFilter::new("info"));
-    // A second subscriber in one process is a test's; the first stays.
-    let terminal = std::io::stderr().is_terminal();
-    let _ =
-        tracing_subscriber::fmt().with_env_filter(filter).with_writer(std::io::stderr).with_ansi(terminal).try_init();
 }

@@ -10,6 +10,7 @@ use reqwest::Url;
 use reqwest::blocking::{Body, Client, Response};
 use serde_json::Value;
 
+use super::bearer::TokenArgs;
 use super::progress::{JobBar, byte_bar, duration};
 use super::{Failed, Outcome, Success};
 
@@ -56,6 +57,8 @@ pub(super) struct Send {
     /// Frames a second, where the source does not say
     #[arg(long, value_name = "F")]
     fps: Option<f64>,
+    #[command(flatten)]
+    token: TokenArgs,
     /// Follow the job to its end and print where to look at the result
     #[arg(long)]
     wait: bool,
@@ -63,17 +66,22 @@ pub(super) struct Send {
 
 impl Send {
     pub(super) fn run(self) -> Outcome {
-        if self.server.scheme() != "http" {
-            return Err(Failed::Input(format!(
-                "--server {}: {} is not spoken yet; expected http://, on this machine or through a tunnel",
-                self.server,
-                self.server.scheme()
-            )));
+        if !matches!(self.server.scheme(), "http" | "https") {
+            return Err(Failed::Input(format!("--server {}: expected http:// or https://", self.server)));
         }
         // The upload takes as long as it takes; all else has its time.
-        let client = Client::builder().timeout(None).connect_timeout(ANSWER).build();
+        let client =
+            Client::builder().timeout(None).connect_timeout(ANSWER).default_headers(self.token.headers()?).build();
         let client = client.map_err(|e| Failed::Other(format!("the HTTP client did not start: {e}")))?;
         self.wait_for_server(&client)?;
+        // Before the bytes: a server that lets nobody in says so at once.
+        answer_of(
+            client
+                .get(self.address("/api/session")?)
+                .timeout(ANSWER)
+                .send()
+                .map_err(|e| Failed::Other(format!("{}: {}", self.server, cause(&e))))?,
+        )?;
         let run = self.upload(&client)?;
         let (run_id, job_id) = (text(&run, "/id"), text(&run, "/job/id"));
         let page = self.address(&format!("/runs/{run_id}"))?;
@@ -233,6 +241,10 @@ fn answer_of(response: Response) -> Result<Value, Failed> {
         return Ok(body);
     }
     let expected = body.get("expected").and_then(Value::as_str).map(|e| format!("; expected {e}")).unwrap_or_default();
+    if status == reqwest::StatusCode::UNAUTHORIZED {
+        let hint = "expected a token in STRIA_TOKEN or --token-file; the server's `stria token create` makes one";
+        return Err(Failed::Input(format!("{url}: {}; {hint}", text(&body, "/detail"))));
+    }
     let detail = text(&body, "/detail");
     // The core's messages say what they expected themselves.
     let words = if detail.contains(&expected) { detail } else { detail + &expected };

@@ -6,7 +6,8 @@ use std::path::PathBuf;
 use clap::Args;
 use tokio_util::sync::CancellationToken;
 
-use super::engine::{Engine, JobArgs, PlaceArgs, StopSignals, block_on, log_to_stderr, slots};
+use super::engine::{Engine, JobArgs, PlaceArgs, StopSignals, block_on, slots};
+use super::logging::LogArgs;
 use super::{Failed, Outcome, Success};
 use crate::config::{JobLimits, Places};
 use crate::db::DatabasePlace;
@@ -28,11 +29,12 @@ pub(super) struct Work {
     data: PathBuf,
     #[command(flatten)]
     jobs: JobArgs,
+    #[command(flatten)]
+    log: LogArgs,
 }
 
 impl Work {
     pub(super) fn run(self) -> Outcome {
-        log_to_stderr();
         let places = self.places.places(&self.data)?;
         let own = Places::in_folder(&self.data);
         // What lies in the worker's own folder no server can see.
@@ -55,17 +57,22 @@ impl Work {
         if slots == 0 {
             return Err(Failed::Input("--slots is 0; expected at least 1".into()));
         }
-        block_on(work(places, self.jobs.limits()?, slots)).map(|()| Success::Done)
+        let (limits, reserve_bytes) = (self.jobs.limits()?, self.jobs.disk_reserve_bytes()?);
+        block_on(async {
+            self.log.start()?;
+            work(places, limits, reserve_bytes, slots).await
+        })
+        .map(|()| Success::Done)
     }
 }
 
-async fn work(places: Places, limits: JobLimits, slots: usize) -> Result<(), Failed> {
+async fn work(places: Places, limits: JobLimits, reserve_bytes: u64, slots: usize) -> Result<(), Failed> {
     let failed = |e: Error| Failed::Other(e.to_string());
     let stop = CancellationToken::new();
     let mut signals = StopSignals::listen().map_err(|e| Failed::Other(format!("signals cannot be heard: {e}")))?;
-    let engine = Engine::start(&places, &limits).await.map_err(failed)?;
+    let engine = Engine::start(&places, &limits, reserve_bytes).await.map_err(failed)?;
     engine.store.ping().await.map_err(|e| Failed::Other(format!("--store {}: {e}", places.store)))?;
-    let worker = engine.worker(&stop).map_err(failed)?;
+    let worker = engine.worker(&stop).await.map_err(failed)?;
     println!("Worker {} takes {slots} jobs at a time from {}", worker.name, places.database);
     let _ = std::io::stdout().flush();
     let mut work = tokio::spawn(worker.run(slots));

@@ -14,6 +14,7 @@ use futures::stream::{BoxStream, StreamExt, TryStreamExt};
 
 use super::problem::Refusal;
 use crate::error::Result;
+use crate::metrics::metrics;
 use crate::store::{Facts, Key, Store};
 
 /// Kept for a year: what has this address never changes.
@@ -58,7 +59,10 @@ pub(super) async fn send(store: &Store, method: &Method, asked: &HeaderMap, file
     }
     let body = match *method {
         Method::HEAD => Body::empty(),
-        _ => Body::from_stream(read(store, file.parts, range).await?),
+        _ => {
+            metrics().bytes_out.inc_by(range.end - range.start);
+            Body::from_stream(read(store, file.parts, range).await?)
+        }
     };
     Ok((status, headers_of(headers), body).into_response())
 }

@@ -1,18 +1,21 @@
 //! What stands before and after every handler: foreign pages are refused, answers begin in time, headers are safe.
 //!
-//! There is no authentication yet, so a page of any other origin that is open in the same browser must not be able to
-//! use the server: neither by writing to it (the browser sends such requests even where it hides the answer), nor by
-//! pointing its own name at this address (DNS rebinding).
+//! A page of any other origin that is open in the same browser must not be able to use the server: neither by writing
+//! to it (the browser sends such requests even where it hides the answer), nor by pointing its own name at this address
+//! (DNS rebinding).
 
 use axum::extract::{Request, State};
 use axum::http::header::{CONTENT_SECURITY_POLICY, HOST, ORIGIN, REFERRER_POLICY, UPGRADE, X_CONTENT_TYPE_OPTIONS};
 use axum::http::{HeaderMap, HeaderValue, Method};
 use axum::middleware::Next;
 use axum::response::{IntoResponse, Response};
+use tracing::Instrument;
 
 use super::App;
 use super::problem::Refusal;
 use crate::error::Error;
+use crate::metrics::{Answer, metrics};
+use crate::queue::Queue;
 
 /// What an answer that brings no policy of its own may do in a browser: nothing.
 const DATA_ONLY: &str = "default-src 'none'; style-src 'unsafe-inline'; img-src data:; sandbox; frame-ancestors 'none'";
@@ -20,12 +23,13 @@ const DATA_ONLY: &str = "default-src 'none'; style-src 'unsafe-inline'; img-src 
 /// Refuses requests under a foreign host name, and writes from a foreign page.
 pub(super) async fn own_origin_only(State(app): State<App>, request: Request, next: Next) -> Response {
     let headers = request.headers();
-    let loopback_only = app.config.listen.ip().is_loopback();
+    // A proxy on this machine asks under the name that the world knows.
+    let loopback_only = app.config.listen.ip().is_loopback() && app.config.doors.trusted_proxies.is_empty();
     if let Err(error) = check_host(headers, request.uri().authority().map(|a| a.as_str()), loopback_only) {
         return error.into_response();
     }
+    // A WebSocket is opened by a GET, and no browser hides it from a foreign page.
     let reads = matches!(*request.method(), Method::GET | Method::HEAD | Method::OPTIONS);
-    // A page of any origin may open a WebSocket: that is as good as a write.
     let upgrades = headers.contains_key(UPGRADE);
     if (!reads || upgrades)
         && let Err(error) = check_origin(headers)
@@ -60,7 +64,7 @@ fn is_loopback_name(host: &str) -> bool {
 }
 
 /// Browsers say where a write comes from; programs say nothing and may go on.
-fn check_origin(headers: &HeaderMap) -> Result<(), Error> {
+pub(super) fn check_origin(headers: &HeaderMap) -> Result<(), Error> {
     if let Some(site) = text(headers, "sec-fetch-site")
         && !matches!(site, "same-origin" | "none")
     {
@@ -70,6 +74,30 @@ fn check_origin(headers: &HeaderMap) -> Result<(), Error> {
     let origin = origin.to_str().unwrap_or_default();
     let own = origin.split_once("://").map(|(_, authority)| authority) == text(headers, HOST);
     if own { Ok(()) } else { Err(Error::Foreign(format!("a write from a page of {origin:?} is refused"))) }
+}
+
+/// The name of a request in logs and answers.
+#[derive(Clone)]
+pub(super) struct RequestId(pub(super) String);
+
+/// Gives every request a name, or keeps the one it came with, and puts all that is logged on the way under it.
+pub(super) async fn named(mut request: Request, next: Next) -> Response {
+    let plain = |id: &&str| (1..=64).contains(&id.len()) && id.bytes().all(|b| b.is_ascii_alphanumeric() || b == b'-');
+    let id = text(request.headers(), "x-request-id").filter(plain).map_or_else(Queue::new_id, Into::into);
+    request.extensions_mut().insert(RequestId(id.clone()));
+    let span = tracing::info_span!("request", id, method = %request.method(), path = request.uri().path());
+    // Methods that nobody knows are one, or their number would grow without bound.
+    let known = ["GET", "HEAD", "POST", "PUT", "PATCH", "DELETE", "OPTIONS"];
+    let method = known.into_iter().find(|m| *m == request.method().as_str()).unwrap_or("other").to_string();
+    let begun = std::time::Instant::now();
+    let mut response = next.run(request).instrument(span.clone()).await;
+    let (status, ms) = (response.status().as_u16(), begun.elapsed().as_millis() as u64);
+    metrics().answers.get_or_create(&Answer { method, status }).inc();
+    span.in_scope(|| tracing::debug!(status, ms, "answered"));
+    if let Ok(value) = HeaderValue::from_str(&id) {
+        response.headers_mut().insert("x-request-id", value);
+    }
+    response
 }
 
 /// Anything but an upload begins to answer within its time.

@@ -1,5 +1,7 @@
 //! Whether the server lives, and whether it can do its work.
 
+use std::time::Duration;
+
 use axum::extract::State;
 use axum::response::{IntoResponse, Response};
 
@@ -7,21 +9,37 @@ use super::App;
 use crate::error::{Error, Result};
 use crate::wire::{Health, Problem};
 
+/// How long the records and the files may take to answer.
+const PATIENCE: Duration = Duration::from_secs(2);
+
 /// The process answers.
 #[utoipa::path(get, path = "/livez", tag = "health", responses((status = 200, body = Health)))]
 pub(super) async fn get_livez() -> Response {
     axum::Json(ok()).into_response()
 }
 
-/// The records answer and the server is not about to stop.
+/// Records and files can be reached, the disk has room, and the server is not about to stop.
 #[utoipa::path(get, path = "/readyz", tag = "health",
     responses((status = 200, body = Health), (status = 503, body = Problem, content_type = "application/problem+json")))]
 pub(super) async fn get_readyz(State(app): State<App>) -> Result<Response> {
     if app.stop.is_cancelled() {
         return Err(Error::Busy("the server is stopping".into()));
     }
-    app.runs.ping().await.map_err(|e| Error::Busy(format!("the records do not answer: {e}")))?;
+    in_time("the records", app.runs.ping()).await?;
+    in_time("the files", app.store.ping()).await?;
+    if let Some(lack) = app.disk.lack() {
+        return Err(Error::Busy(lack));
+    }
     Ok(axum::Json(ok()).into_response())
+}
+
+/// Whoever asks does not wait as long as the work may.
+async fn in_time(what: &str, asked: impl Future<Output = Result<()>>) -> Result<()> {
+    match tokio::time::timeout(PATIENCE, asked).await {
+        Ok(Ok(())) => Ok(()),
+        Ok(Err(e)) => Err(Error::Busy(format!("{what} do not answer: {e}"))),
+        Err(_) => Err(Error::Busy(format!("{what} do not answer within {} s", PATIENCE.as_secs()))),
+    }
 }
 
 fn ok() -> Health {

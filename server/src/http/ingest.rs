@@ -70,6 +70,7 @@ async fn receive(app: &App, parts: &axum::http::request::Parts, body: Body) -> R
     if announced.is_some_and(|bytes| bytes > most) {
         return Err(Error::TooLarge { limit_bytes });
     }
+    app.disk.check(announced.unwrap_or(0))?;
     let Ok(_permit) = app.arrivals.clone().try_acquire_owned() else {
         let most = app.config.requests.uploads_at_once;
         return Err(Error::Busy(format!("{most} uploads are coming in already; come back in a moment")));

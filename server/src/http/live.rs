@@ -125,6 +125,7 @@ struct Talk {
 
 impl Talk {
     async fn run(&mut self, stream: &str) -> Result<()> {
+        self.app.disk.check(0)?;
         let _place = self.app.streams.clone().try_acquire_owned().map_err(|_| too_many(&self.app))?;
         let hello = self.hello(stream).await?;
         let mut connection = self.app.live.open(hello).await?;
@@ -355,6 +356,7 @@ pub(super) async fn post_stream(State(app): State<App>, Path(stream): Path<Strin
 }
 
 async fn receive(app: &App, stream: String, parts: &Parts, body: Body) -> Result<LiveEnded> {
+    app.disk.check(0)?;
     let _place = app.streams.clone().try_acquire_owned().map_err(|_| too_many(app))?;
     let pairs = axum::extract::Query::<Vec<(String, String)>>::try_from_uri(&parts.uri)
         .map_err(|e| Error::field("query", e.body_text(), "fields as name=value"))?;

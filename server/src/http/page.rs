@@ -5,7 +5,7 @@ use std::io::Write;
 use std::sync::{Arc, LazyLock, OnceLock};
 
 use axum::Router;
-use axum::extract::Path;
+use axum::extract::{Path, State};
 use axum::http::header::{
     ACCEPT_ENCODING, CACHE_CONTROL, CONTENT_ENCODING, CONTENT_SECURITY_POLICY, CONTENT_TYPE, ETAG, VARY,
 };
@@ -17,8 +17,8 @@ use re_web_viewer_server::WebViewerData;
 use rust_embed::RustEmbed;
 use sha2::{Digest, Sha256};
 
-use super::App;
 use super::files::{IMMUTABLE, REVALIDATE, none_matches};
+use super::{App, doors, session};
 use crate::error::{Error, Result};
 use crate::store::hex;
 
@@ -40,7 +40,7 @@ pub(super) fn routes() -> Router<App> {
     Router::new().route("/viewer/{*path}", get(get_viewer)).fallback(get_page)
 }
 
-async fn get_page(uri: Uri, headers: HeaderMap) -> Result<Response> {
+async fn get_page(State(app): State<App>, uri: Uri, headers: HeaderMap) -> Result<Response> {
     let path = uri.path().trim_start_matches('/');
     // The squeezed forms have no address of their own.
     let exact = Page::get(path).filter(|_| !path.ends_with(".br")).map(|file| (path, file));
@@ -50,6 +50,9 @@ async fn get_page(uri: Uri, headers: HeaderMap) -> Result<Response> {
     let Some((name, file)) = exact.or_else(index) else {
         return Err(Error::NotFound { what: "address", id: uri.path().into() });
     };
+    if name == "index.html" && !doors::is_somebody(&app, &headers).await? {
+        return Ok(session::ask_to_log_in(&uri));
+    }
     // The page's build puts a hash of the content into the names below assets/.
     let cache = if name.starts_with("assets/") { IMMUTABLE } else { REVALIDATE };
     let name = name.to_string();

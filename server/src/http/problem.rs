@@ -2,10 +2,11 @@
 
 use std::any::Any;
 
-use axum::http::header::{CACHE_CONTROL, CONTENT_TYPE, RETRY_AFTER};
+use axum::http::header::{CACHE_CONTROL, CONTENT_TYPE, RETRY_AFTER, WWW_AUTHENTICATE};
 use axum::http::{HeaderValue, StatusCode};
 use axum::response::{IntoResponse, Response};
 
+use crate::auth::Scope;
 use crate::error::Error;
 use crate::wire::Problem;
 
@@ -22,6 +23,12 @@ pub(super) enum Refusal {
     Version { found: String, expected: &'static str },
     /// The answer did not begin in time.
     TooSlow,
+    /// Nobody that we know asks; `said` where a token or a session came along.
+    Unknown { said: bool },
+    /// Whoever asks may not do this.
+    Scope { needed: Scope },
+    /// Whoever asks came too often.
+    TooMany { retry_after_s: u64 },
 }
 
 /// What tus 1.0.0 answers to a wrong checksum.
@@ -82,7 +89,12 @@ pub(super) fn problem_of(error: Error) -> Problem {
         Error::Foreign(_) => {
             problem(StatusCode::FORBIDDEN, "foreign-origin", "The request comes from elsewhere", detail, false)
         }
-        Error::LeaseLost | Error::Records(_) | Error::Store(_) | Error::Io { .. } | Error::Internal(_) => {
+        Error::NoRoom(_)
+        | Error::LeaseLost
+        | Error::Records(_)
+        | Error::Store(_)
+        | Error::Io { .. }
+        | Error::Internal(_) => {
             // The cause is for the log; what leaves the server names no folder of it.
             tracing::error!(%detail, "a request failed");
             let detail = "the server failed; its log says why".into();
@@ -125,6 +137,31 @@ impl IntoResponse for Refusal {
                 let mut problem = problem(status, "wrong-version", "The protocol's version does not fit", found, false);
                 problem.expected = Some(expected.into());
                 send(status, &problem)
+            }
+            Refusal::Unknown { said } => {
+                let detail = match said {
+                    true => "the token or session is wrong, revoked or over",
+                    false => "the request brings no token",
+                };
+                let status = StatusCode::UNAUTHORIZED;
+                let mut problem = problem(status, "unknown", "Nobody that this server knows", detail.into(), false);
+                problem.field = Some("Authorization".into());
+                problem.expected =
+                    Some("Bearer and a token (`stria token create`), or a browser that logged in".into());
+                let mut response = send(status, &problem);
+                response.headers_mut().insert(WWW_AUTHENTICATE, HeaderValue::from_static("Bearer realm=\"stria\""));
+                response
+            }
+            Refusal::Scope { needed } => {
+                let detail = format!("this needs the scope '{}'", needed.as_str());
+                answer(StatusCode::FORBIDDEN, "scope", "The token may not do this", detail, false)
+            }
+            Refusal::TooMany { retry_after_s } => {
+                let status = StatusCode::TOO_MANY_REQUESTS;
+                let detail = format!("more requests than this server takes from one; come back in {retry_after_s} s");
+                let mut response = answer(status, "too-many", "Too many requests", detail, true);
+                response.headers_mut().insert(RETRY_AFTER, HeaderValue::from(retry_after_s));
+                response
             }
             Refusal::TooSlow => {
                 let detail = "the server did not answer in time".into();

@@ -29,6 +29,10 @@ pub(super) struct RunQuery {
     to: Option<String>,
     /// `created`, `recorded` or `asset`, with a minus before it for the other way round; `-created` when nothing is said.
     sort: Option<String>,
+    /// Recorded with the rig of this name.
+    rig: Option<String>,
+    /// Whose latest job has the recipe of this name.
+    recipe: Option<String>,
     /// `next_cursor` of the page before.
     cursor: Option<String>,
     /// Most items, 1 to 1000; 50 when nothing is said.
@@ -41,7 +45,8 @@ pub(super) struct RunQuery {
 pub(super) async fn list_runs(State(app): State<App>, Query(query): Query<RunQuery>) -> Result<Response> {
     let page = Page::new(query.cursor, query.limit)?;
     let sort = RunSort::parse(query.sort.as_deref())?;
-    let filter = RunFilter { asset: query.asset, state: query.state, q: query.q, from: query.from, to: query.to, sort };
+    let RunQuery { asset, state, q, from, to, rig, recipe, .. } = query;
+    let filter = RunFilter { asset, state, q, from, to, rig, recipe, sort };
     Ok(axum::Json(app.runs.list(&filter, &page).await?).into_response())
 }
 

@@ -215,6 +215,7 @@ async fn create(app: App, parts: Parts, body: Body) -> Result<Response> {
     {
         return Err(Error::TooLarge { limit_bytes: length });
     }
+    app.disk.check(length_bytes.unwrap_or(0))?;
     let made = app.uploads.create(new, idempotency_key(headers)?.as_deref()).await?;
     let location = format!("/api/uploads/{}", made.id);
     let upload = if has_piece {
@@ -269,6 +270,7 @@ async fn patch(app: &App, id: &str, parts: &Parts, body: Body) -> Result<Respons
 
 /// Takes a piece in, as far as it comes.
 async fn receive(app: &App, held: &mut Held, mut body: Body, mut checksum: Option<Checksum>) -> Result<()> {
+    app.disk.check(0)?;
     let Ok(_permit) = app.arrivals.clone().try_acquire_owned() else {
         let most = app.config.requests.uploads_at_once;
         return Err(Error::Busy(format!("{most} uploads are coming in already; come back in a moment")));

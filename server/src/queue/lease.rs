@@ -49,6 +49,8 @@ pub struct Lease {
     pub fps: Option<f64>,
     /// When the run was recorded, ms since 1970.
     pub recorded_ms: i64,
+    /// True for a job of a batch.
+    pub in_batch: bool,
 }
 
 impl Lease {
@@ -66,6 +68,7 @@ impl Lease {
             source: Facts { bytes: run.source_bytes.unsigned_abs(), sha256: run.source_sha256 },
             fps: run.fps,
             recorded_ms: run.recorded_ms,
+            in_batch: job.batch_id.is_some(),
         }
     }
 
@@ -265,6 +268,15 @@ impl Queue {
         unpublished::Entity::delete_by_id(store::attempt_prefix(&lease.job, lease.fence)).exec(&*t).await?;
         let line = format!("attempt {} is done: {count} products", lease.attempt);
         add_log_line(&*t, &lease.job, lease.attempt, &line, &self.limits).await?;
+        if lease.in_batch {
+            // Only now does the run show it instead of the result before; a job asked for since then stays.
+            run::Entity::update_many()
+                .col_expr(run::Column::LatestJob, Expr::value(lease.job.as_str()))
+                .filter(run::Column::Id.eq(&lease.run))
+                .filter(run::Column::LatestJob.lt(lease.job.as_str()))
+                .exec(&*t)
+                .await?;
+        }
         repeat_in_run(&*t, &lease.job, JobState::Done).await?;
         t.commit().await?;
         self.bell.ring();
@@ -280,17 +292,21 @@ impl Queue {
         let t = self.db.write().await?;
         let row = lease_holds(&*t, lease).await?;
         let failures = row.failures + 1;
-        let again = failure.retryable && failures < self.limits.max_failures;
+        let state = match failure.retryable && failures < self.limits.max_failures {
+            true => back_or_cancelled(&row),
+            false => JobState::Failed,
+        };
+        let again = state == JobState::Queued;
         let change = job::ActiveModel {
             failures: Set(failures),
             error: Set(Some(problem_of(failure, again)?)),
             not_before_ms: Set(now_ms() + wait_ms(&self.limits, failures)),
-            ..if again { requeued() } else { ended(JobState::Failed) }
+            ..if again { requeued() } else { ended(state) }
         };
         let then = if again { "it will be tried again" } else { "it will not be tried again" };
         let line = format!("attempt {} failed ({}): {}; {then}", lease.attempt, failure.kind, failure.message);
         add_log_line(&*t, &lease.job, lease.attempt, &line, &self.limits).await?;
-        self.leave(&*t, lease, change, if again { JobState::Queued } else { JobState::Failed }).await?;
+        self.leave(&*t, lease, change, state).await?;
         t.commit().await?;
         self.bell.ring();
         Ok(())
@@ -318,8 +334,37 @@ impl Queue {
     async fn try_release(&self, lease: &Lease) -> Result<()> {
         let t = self.db.write().await?;
         let row = lease_holds(&*t, lease).await?;
-        let change = job::ActiveModel { attempt: Set(row.attempt - 1), not_before_ms: Set(0), ..requeued() };
-        self.leave(&*t, lease, change, JobState::Queued).await?;
+        let state = back_or_cancelled(&row);
+        let change = job::ActiveModel {
+            attempt: Set(row.attempt - 1),
+            not_before_ms: Set(0),
+            ..if state == JobState::Queued { requeued() } else { ended(state) }
+        };
+        self.leave(&*t, lease, change, state).await?;
+        t.commit().await?;
+        self.bell.ring();
+        Ok(())
+    }
+
+    /// What the attempt needs was away: back to the queue for a while, and the attempt is not counted.
+    pub async fn postpone(&self, lease: &Lease, failure: &Failure) -> Result<()> {
+        retried(self.limits.record_patience, || self.try_postpone(lease, failure)).await
+    }
+
+    async fn try_postpone(&self, lease: &Lease, failure: &Failure) -> Result<()> {
+        let t = self.db.write().await?;
+        let row = lease_holds(&*t, lease).await?;
+        let wait_ms = self.limits.postpone.as_millis() as i64;
+        let state = back_or_cancelled(&row);
+        let change = job::ActiveModel {
+            attempt: Set(row.attempt - 1),
+            error: Set(Some(problem_of(failure, true)?)),
+            not_before_ms: Set(now_ms() + wait_ms),
+            ..if state == JobState::Queued { requeued() } else { ended(state) }
+        };
+        let line = format!("attempt {} is put off: {}", lease.attempt, failure.message);
+        add_log_line(&*t, &lease.job, lease.attempt, &line, &self.limits).await?;
+        self.leave(&*t, lease, change, state).await?;
         t.commit().await?;
         self.bell.ring();
         Ok(())
@@ -348,6 +393,11 @@ impl Queue {
         mark_unpublished(records, store::attempt_prefix(&lease.job, lease.fence), now_ms()).await?;
         repeat_in_run(records, &lease.job, state).await
     }
+}
+
+/// Where a job goes that would be tried again: whoever asked it to stop meanwhile is heard.
+fn back_or_cancelled(row: &job::Model) -> JobState {
+    if row.cancel_requested == 0 { JobState::Queued } else { JobState::Cancelled }
 }
 
 /// Columns of a job that goes back to the queue.
@@ -380,8 +430,10 @@ pub(super) fn problem_of(failure: &Failure, again: bool) -> Result<String> {
     let title = match failure.kind.as_str() {
         "bad_input" => "The run cannot be processed as it is",
         "killed" => "The processing was killed",
+        "out_of_memory" => "The processing ran out of memory",
         "time_limit" => "The processing took too long",
         "lost" => "The worker was lost",
+        "away" => "The records or the files could not be reached",
         "io" => "A file could not be read or written",
         _ => "The processing failed",
     };

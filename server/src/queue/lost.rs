@@ -10,6 +10,7 @@ use super::{Queue, mark_unpublished, repeat_in_run};
 use crate::db::tables::{job, segment};
 use crate::db::{ANSWER_PATIENCE, retried};
 use crate::error::Result;
+use crate::metrics::metrics;
 use crate::store;
 use crate::wire::JobState;
 use crate::wire::child::Failure;
@@ -114,6 +115,7 @@ impl LeaseWatch {
             if now.duration_since(since) >= self.queue.limits.lease {
                 let lose = || self.queue.lose(&id, fence, beat, now_ms() + LOST_FILES_MS);
                 if retried(ANSWER_PATIENCE, lose).await? {
+                    metrics().leases_lost.inc();
                     tracing::warn!(job = id, "a lease without a sign of life was ended");
                 }
             }

@@ -10,13 +10,13 @@ use crate::db::tables::{asset, product};
 use crate::store::{Facts, ProductName};
 use crate::wire::child::Failure;
 
-struct Records {
-    queue: Queue,
-    db: Db,
+pub(super) struct Records {
+    pub(super) queue: Queue,
+    pub(super) db: Db,
     _folder: tempfile::TempDir,
 }
 
-async fn records(limits: JobLimits) -> Records {
+pub(super) async fn records(limits: JobLimits) -> Records {
     let folder = tempfile::tempdir().expect("folder");
     let db = Db::open(&DatabasePlace::Sqlite(folder.path().join("stria.db"))).await.expect("opens");
     let row = asset::ActiveModel { name: Set("wall".into()), created_ms: Set(0) };
@@ -25,7 +25,7 @@ async fn records(limits: JobLimits) -> Records {
 }
 
 impl Records {
-    async fn add(&self, priority: Priority) -> String {
+    pub(super) async fn add(&self, priority: Priority) -> String {
         let run = Queue::new_id();
         let row = run::ActiveModel {
             id: Set(run.clone()),
@@ -62,7 +62,7 @@ impl Records {
         self.queue.claim(Wanted::Any, "node", "worker").await.expect("claims")
     }
 
-    async fn job(&self, id: &str) -> job::Model {
+    pub(super) async fn job(&self, id: &str) -> job::Model {
         find_to_change(self.db.read(), id).await.expect("exists")
     }
 
@@ -72,7 +72,7 @@ impl Records {
     }
 }
 
-fn outcome() -> Outcome {
+pub(super) fn outcome() -> Outcome {
     let facts = Facts { bytes: 3, sha256: "00".into() };
     let name = ProductName::new("depth.tif").expect("plain");
     let products = vec![PublishedProduct { name, facts }];

@@ -38,7 +38,7 @@ impl Page {
     }
 
     /// Queries ask for one row more than the page holds: it tells whether there is a next page.
-    pub(super) fn next<T>(&self, rows: &mut Vec<T>, name: impl Fn(&T) -> String) -> Option<String> {
+    pub(crate) fn next<T>(&self, rows: &mut Vec<T>, name: impl Fn(&T) -> String) -> Option<String> {
         if rows.len() as u64 <= self.limit {
             return None;
         }
@@ -48,7 +48,8 @@ impl Page {
 }
 
 /// Which runs to list.
-#[derive(Clone, Debug, Default)]
+#[derive(Clone, Debug, Default, serde::Serialize, serde::Deserialize)]
+#[serde(deny_unknown_fields)]
 pub struct RunFilter {
     /// Of this asset.
     pub asset: Option<String>,
@@ -60,7 +61,12 @@ pub struct RunFilter {
     pub from: Option<String>,
     /// Recorded before this time.
     pub to: Option<String>,
+    /// Recorded with the rig of this name.
+    pub rig: Option<String>,
+    /// Whose latest job has the recipe of this name.
+    pub recipe: Option<String>,
     /// In which order.
+    #[serde(skip)]
     pub sort: RunSort,
 }
 
@@ -139,13 +145,24 @@ impl RunSort {
 }
 
 impl RunFilter {
-    fn condition(&self) -> Result<Condition> {
+    pub(crate) fn condition(&self) -> Result<Condition> {
         let mut all = Condition::all();
         if let Some(asset) = &self.asset {
             all = all.add(run::Column::Asset.eq(asset.as_str()));
         }
         if let Some(state) = &self.state {
             all = all.add(run::Column::State.eq(read_state(state)?.as_str()));
+        }
+        if let Some(rig) = &self.rig {
+            all = all.add(run::Column::RigName.eq(rig));
+        }
+        if let Some(recipe) = &self.recipe {
+            let with_it = sea_query::Query::select()
+                .column(job::Column::Id)
+                .from(job::Entity)
+                .and_where(job::Column::RecipeName.eq(recipe))
+                .to_owned();
+            all = all.add(run::Column::LatestJob.in_subquery(with_it));
         }
         if let Some(q) = self.q.as_ref().filter(|q| !q.is_empty()) {
             // PostgreSQL's LIKE tells capitals from small letters, SQLite's only outside ASCII, as does its `lower`.
@@ -176,7 +193,7 @@ fn escaped(text: &str) -> String {
 
 fn read_state(text: &str) -> Result<JobState> {
     JobState::parse(text).ok_or_else(|| {
-        Error::field("state", format!("state is {text:?}"), "queued, running, done, failed or cancelled")
+        Error::field("state", format!("state is {text:?}"), "queued, running, done, failed, cancelled or paused")
     })
 }
 
@@ -312,6 +329,7 @@ pub(super) fn job_of(row: job::Model) -> Result<wire::Job> {
         started_at: row.started_ms.map(to_text),
         finished_at: row.finished_ms.map(to_text),
         next_attempt_at: waits.then(|| to_text(row.not_before_ms)),
+        batch: row.batch_id,
         id: row.id,
         run: row.run_id,
         stage: row.stage,

@@ -50,6 +50,11 @@ impl Key {
         Key::new(format!("{}recording/{number:06}.rrd", attempt_prefix(job, fence)))
     }
 
+    /// A key as a backup lists it.
+    pub fn of_backup(text: &str) -> Key {
+        Key::new(text.into())
+    }
+
     /// The last part of the name.
     pub fn filename(&self) -> &str {
         self.0.filename().unwrap_or_default()

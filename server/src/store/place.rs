@@ -4,8 +4,8 @@ use std::fmt;
 use std::path::PathBuf;
 use std::time::Duration;
 
-use object_store::ClientOptions;
 use object_store::aws::{AmazonS3, AmazonS3Builder};
+use object_store::{BackoffConfig, ClientOptions, RetryConfig};
 
 use crate::error::{Error, Result};
 
@@ -73,8 +73,15 @@ pub(super) fn s3(bucket: &str) -> Result<AmazonS3> {
             builder = builder.with_config(key, value);
         }
     }
-    let built = builder.with_bucket_name(bucket).build();
+    let built = builder.with_bucket_name(bucket).with_retry(retry()).build();
     built.map_err(|e| Error::field("--store", format!("s3://{bucket}: {e}"), "the AWS_* variables of an S3 service"))
+}
+
+/// An S3 that is away for a minute or two costs nothing but time.
+fn retry() -> RetryConfig {
+    let backoff =
+        BackoffConfig { init_backoff: Duration::from_millis(100), max_backoff: Duration::from_secs(5), base: 2.0 };
+    RetryConfig { backoff, max_retries: 1000, retry_timeout: Duration::from_secs(180) }
 }
 
 #[cfg(test)]

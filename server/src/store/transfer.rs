@@ -79,9 +79,15 @@ impl Store {
             return Ok(files.path_to_filesystem(&self.path(key))?);
         }
         let to = folder.join(key.filename());
-        let unwritable = |e| Error::io(&to, e);
+        self.copy_out(key, facts, &to).await?;
+        Ok(to)
+    }
+
+    /// Copies a file to a path outside the store, and checks it.
+    pub async fn copy_out(&self, key: &Key, facts: &Facts, to: &Path) -> Result<()> {
+        let unwritable = |e| Error::io(to, e);
         let mut bytes = self.objects.get(&self.path(key)).await?.into_stream();
-        let mut file = tokio::fs::File::create(&to).await.map_err(unwritable)?;
+        let mut file = tokio::fs::File::create(to).await.map_err(unwritable)?;
         let mut hash = Sha256::new();
         let mut count = 0;
         while let Some(chunk) = bytes.try_next().await? {
@@ -91,8 +97,7 @@ impl Store {
         }
         file.flush().await.map_err(unwritable)?;
         let found = Facts { bytes: count, sha256: hex(&hash.finalize()) };
-        check(Path::new(key.as_str()), &found, Some(facts))?;
-        Ok(to)
+        check(Path::new(key.as_str()), &found, Some(facts))
     }
 }
 

@@ -30,7 +30,8 @@ pub enum End {
 /// Why a processing failed.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 pub struct Failure {
-    /// `bad_input`, `io`, `cancelled`, `internal`; the worker adds `killed`, `time_limit` and `lost`.
+    /// `bad_input`, `io`, `cancelled`, `internal`; the worker adds `killed`, `out_of_memory`, `time_limit`, `away` and
+    /// `lost`.
     pub kind: String,
     /// In words.
     pub message: String,

@@ -19,11 +19,14 @@ pub enum JobState {
     Failed,
     /// Someone stopped it.
     Cancelled,
+    /// It would wait for a worker, but its batch is paused.
+    Paused,
 }
 
 impl JobState {
-    const ALL: [JobState; 5] =
-        [JobState::Queued, JobState::Running, JobState::Done, JobState::Failed, JobState::Cancelled];
+    /// All of them.
+    pub const ALL: [JobState; 6] =
+        [JobState::Queued, JobState::Running, JobState::Done, JobState::Failed, JobState::Cancelled, JobState::Paused];
 
     /// As records and requests write it.
     pub fn as_str(self) -> &'static str {
@@ -33,6 +36,7 @@ impl JobState {
             JobState::Done => "done",
             JobState::Failed => "failed",
             JobState::Cancelled => "cancelled",
+            JobState::Paused => "paused",
         }
     }
 
@@ -61,6 +65,9 @@ pub enum Priority {
 }
 
 impl Priority {
+    /// The most urgent first.
+    pub const ALL: [Priority; 3] = [Priority::Live, Priority::Upload, Priority::Batch];
+
     /// As records and requests write it.
     pub fn as_str(self) -> &'static str {
         match self {
@@ -72,7 +79,7 @@ impl Priority {
 
     /// Reads [`Priority::as_str`]'s words.
     pub fn parse(text: &str) -> Option<Priority> {
-        [Priority::Live, Priority::Upload, Priority::Batch].into_iter().find(|p| p.as_str() == text)
+        Priority::ALL.into_iter().find(|p| p.as_str() == text)
     }
 }
 
@@ -103,6 +110,9 @@ pub struct Job {
     pub attempt: u32,
     /// Who goes first.
     pub priority: Priority,
+    /// The batch that it belongs to.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub batch: Option<String>,
     /// The rig's name.
     pub rig: String,
     /// The recipe's name; `custom` for one that came as text.

@@ -5,6 +5,7 @@ use std::time::Duration;
 use stria_core::pipeline::Event;
 use tokio::sync::watch;
 use tokio::time::Instant;
+use tracing::Instrument;
 
 use super::child::{Child, Said};
 use super::follow::Source;
@@ -12,6 +13,7 @@ use super::scratch::Scratch;
 use super::showcase::Showcase;
 use super::{Worker, publish};
 use crate::error::{Error, Result};
+use crate::metrics::metrics;
 use crate::queue::{Lease, Outcome, Progress, Signal};
 use crate::wire::child::Failure;
 
@@ -23,6 +25,8 @@ enum Ended {
     Done(Outcome),
     Failed(Failure),
     Cancelled,
+    /// The records or the store were away for too long; that is not the job's fault.
+    Postponed(Failure),
     /// Another owns the job, or it is gone: nothing may be written any more.
     Lost,
     /// The worker stops; the job goes back.
@@ -31,15 +35,29 @@ enum Ended {
 
 /// Works on a job until its end, whatever that is, and writes it down.
 pub(super) async fn run(worker: &Worker, lease: &Lease) {
+    let span = tracing::info_span!("attempt", job = %lease.job, run = %lease.run, attempt = lease.attempt);
+    attempt(worker, lease).instrument(span).await;
+}
+
+async fn attempt(worker: &Worker, lease: &Lease) {
     tracing::info!(job = %lease.job, attempt = lease.attempt, "begins");
     let (signals, heart) = beat(worker, lease);
     let ended = match work(worker, lease, signals).await {
         Ok(ended) => ended,
         Err(Error::LeaseLost) => Ended::Lost,
+        Err(error) if error.is_passing() => Ended::Postponed(Failure::new("away", error.to_string(), true)),
         Err(error @ Error::Internal(_)) => Ended::Failed(Failure::new("internal", error.to_string(), true)),
         Err(error) => Ended::Failed(Failure::new("io", error.to_string(), true)),
     };
     heart.abort();
+    metrics().attempt_ended(match &ended {
+        Ended::Done(_) => "done",
+        Ended::Failed(failure) => &failure.kind,
+        Ended::Cancelled => "cancelled",
+        Ended::Postponed(_) => "postponed",
+        Ended::Released => "released",
+        Ended::Lost => "lost",
+    });
     let written = tokio::select! {
         written = write_down(worker, lease, ended) => written,
         () = stopped_for(worker, worker.limits.stop_patience) => {
@@ -73,6 +91,10 @@ async fn write_down(worker: &Worker, lease: &Lease, ended: Ended) -> Result<()> 
         Ended::Failed(failure) => {
             tracing::warn!(job = %lease.job, kind = failure.kind, message = failure.message, "failed");
             worker.queue.fail(lease, &failure).await
+        }
+        Ended::Postponed(failure) => {
+            tracing::warn!(message = failure.message, "postponed");
+            worker.queue.postpone(lease, &failure).await
         }
         Ended::Cancelled => worker.queue.cancelled(lease).await,
         Ended::Released => worker.queue.release(lease).await,
@@ -210,6 +232,7 @@ impl Teller<'_> {
         let (queue, limits) = (&self.worker.queue, &self.worker.limits);
         match said {
             Said::Event(Event::Progress { stage, fraction, frames, frames_total, frames_per_s, time_left_s }) => {
+                metrics().frames_per_s.set(frames_per_s);
                 let progress = Progress { stage, fraction, frames, frames_total, frames_per_s, time_left_s };
                 let before = std::mem::replace(&mut self.progress, progress);
                 let same_stage = before.stage == self.progress.stage;

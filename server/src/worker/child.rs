@@ -8,10 +8,11 @@ use rustix::process::{Pid, Resource, Rlimit, Signal, kill_process_group, prlimit
 use stria_core::export::manifest::Manifest;
 use stria_core::pipeline::Event;
 use tokio::io::{AsyncBufRead, AsyncBufReadExt, BufReader};
-use tokio::process::{ChildStderr, ChildStdin, ChildStdout, Command};
+use tokio::process::{ChildStderr, ChildStdin, ChildStdout};
 
 use super::Worker;
 use super::scratch::Scratch;
+use crate::config::GB;
 use crate::error::{Error, Result};
 use crate::queue::Lease;
 use crate::wire::child::{End, Failure, Line};
@@ -22,6 +23,16 @@ const NICENESS: i32 = 10;
 
 /// Longest line of stderr that is looked at, bytes; the rest of it is dropped.
 const STDERR_LINE_BYTES: usize = 4096;
+
+/// How Rust, C++, OpenCV, FFmpeg and the loader say that they got no memory.
+const OUT_OF_MEMORY: [&str; 6] = [
+    "memory allocation of",
+    "bad_alloc",
+    "Insufficient memory",
+    "Cannot allocate memory",
+    "failed to map segment",
+    "Out of memory",
+];
 
 /// What a child says while it works.
 pub(super) enum Said {
@@ -43,12 +54,13 @@ pub(super) struct Child {
     nonsense: Option<String>,
     last_words: Vec<u8>,
     last_words_bytes: usize,
+    memory_bytes: u64,
 }
 
 impl Child {
     /// Starts `stria process` on the run's source.
     pub(super) fn start(worker: &Worker, lease: &Lease, scratch: &Scratch, source: &Path) -> Result<Child> {
-        let mut command = Command::new(&worker.program);
+        let mut command = worker.confined.command(&worker.program);
         command.arg("process").arg(source);
         command.arg("--rig").arg(scratch.rig()).arg("--recipe").arg(scratch.recipe()).arg("--out").arg(scratch.out());
         command.arg("--recorded-at").arg(to_text(lease.recorded_ms));
@@ -75,6 +87,7 @@ impl Child {
             nonsense: None,
             last_words: Vec::new(),
             last_words_bytes: limits.last_words_bytes,
+            memory_bytes: limits.memory_bytes,
         })
     }
 
@@ -138,9 +151,24 @@ impl Child {
         drop(self.stdin.take());
         match (status.code(), self.end.take()) {
             (Some(0 | 3), Some(End::Result { manifest })) => Ok(manifest),
-            (Some(_), Some(End::Error(failure))) if failure.kind != "cancelled" => Err(failure),
-            _ => Err(self.unexpected(status)),
+            (Some(_), Some(End::Error(failure))) if failure.kind != "cancelled" => Err(self.or_memory(failure)),
+            _ => Err(self.or_memory(self.unexpected(status))),
         }
+    }
+
+    /// A failure that was the memory limit's says so, whatever part of the processing ran into it.
+    fn or_memory(&self, failure: Failure) -> Failure {
+        let words = String::from_utf8_lossy(&self.last_words);
+        let ran_out = OUT_OF_MEMORY.iter().any(|w| failure.message.contains(w) || words.contains(w));
+        if failure.kind == "bad_input" || !ran_out {
+            return failure;
+        }
+        let limit_gb = self.memory_bytes as f64 / GB as f64;
+        let message = format!(
+            "the processing ran out of memory; its limit is {limit_gb} GB (--job-memory-limit-gb); {}",
+            failure.message
+        );
+        Failure::new("out_of_memory", message, failure.retryable)
     }
 
     fn unexpected(&self, status: ExitStatus) -> Failure {
@@ -194,7 +222,7 @@ fn signal_name(signal: i32) -> &'static str {
         6 => "SIGABRT, as after a failed allocation",
         7 => "SIGBUS",
         8 => "SIGFPE",
-        9 => "SIGKILL, as when memory runs out",
+        9 => "SIGKILL, as when the machine's memory runs out",
         11 => "SIGSEGV",
         15 => "SIGTERM",
         _ => "see signal(7)",

@@ -8,6 +8,7 @@ use stria_core::export::manifest::{FileEntry, Manifest};
 use super::Worker;
 use super::scratch::Scratch;
 use crate::error::{Error, Result};
+use crate::metrics::{Stage, metrics};
 use crate::queue::{Lease, Outcome, PublishedProduct};
 use crate::store::{Facts, Key, ProductName, facts_of};
 
@@ -35,6 +36,10 @@ pub(super) async fn store(worker: &Worker, lease: &Lease, scratch: &Scratch, man
     let into_store: Vec<_> = products.iter().map(|product| put(worker, lease, &out, product)).collect();
     futures::stream::iter(into_store).buffer_unordered(FILES_AT_ONCE).try_collect::<()>().await?;
     worker.store.sync().await?;
+    for (stage, seconds) in &manifest.timings_s {
+        metrics().stage_s.get_or_create(&Stage { stage: stage.clone() }).observe(*seconds);
+    }
+    metrics().frames.inc_by(manifest.quality.frames);
     let quality = serde_json::to_value(&manifest.quality).map_err(|e| Error::Internal(format!("quality: {e}")))?;
     Ok(Outcome { products, warnings: manifest.warnings, quality, frames: manifest.quality.frames })
 }
