@@ -76,7 +76,7 @@ def main():
             for _ in range(size_mb):
                 file.write(os.urandom(1_000_000))
         server = subprocess.Popen(
-            [STRIA, "serve", "--listen", "127.0.0.1:0", "--data", folder / "data", "--workers", "0"],
+            [STRIA, "serve", "--listen", "127.0.0.1:0", "--data", folder / "data", "--workers", "0", "--without-authentication"],
             stdout=subprocess.PIPE, text=True,
         )
         try:
