@@ -1,6 +1,7 @@
 //! The command line: one file per command. A command returns its exit code; errors are said here, once.
 
 mod backup;
+mod bearer;
 mod calibrate;
 mod compare;
 mod engine;

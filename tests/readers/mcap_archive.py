@@ -4,6 +4,7 @@ usage: mcap_archive.py FILE [VIDEO_OUT] : VIDEO_OUT gets the frames of /camera/v
 """
 
 import json
+import math
 import struct
 import sys
 
@@ -69,7 +70,9 @@ def grid(message):
 
 def image32(message):
     z = np.frombuffer(message.data, "<f4").reshape(message.height, message.step // 4)
-    return {"encoding": message.encoding, "shape": list(z.shape), "last": float(z[-1, -1])}
+    last = float(z[-1, -1])
+    # What was not measured is NaN, for which JSON has no word.
+    return {"encoding": message.encoding, "shape": list(z.shape), "last": last if math.isfinite(last) else None}
 
 
 def scene(message):

@@ -314,7 +314,7 @@ mod tests {
     #[test]
     fn dents_do_not_bend_the_plane() {
         let places = places(|x, y| 850.0 + 0.01 * x - 0.02 * y);
-        assert_eq!(choose(&[places.clone()]).0, Shape::Plane);
+        assert_eq!(choose(std::slice::from_ref(&places)).0, Shape::Plane);
         let plane = fit(Shape::Plane, &places).expect("a fit");
         assert!((plane.z_mm(300.0, 50.0) - (850.0 + 3.0 - 1.0)).abs() < 0.05, "{plane:?}");
     }
@@ -323,7 +323,7 @@ mod tests {
     fn a_pipe_is_known_from_outside_and_from_inside() {
         for (sign, from_outside) in [(-1.0, true), (1.0, false)] {
             let places = places(|x, y| 750.0 + 0.002 * x + sign * (300.0_f64.powi(2) - (y - 12.0).powi(2)).sqrt());
-            let (shape, _) = choose(&[places.clone()]);
+            let (shape, _) = choose(std::slice::from_ref(&places));
             let Shape::Cylinder { radius_mm, from_outside: found } = shape else { panic!("{shape:?}") };
             assert!((radius_mm - 300.0).abs() < 0.6 && found == from_outside, "{shape:?}");
             let fitted = fit(shape, &places).expect("a fit");

@@ -77,7 +77,7 @@ fn an_empty_wall_gives_an_empty_list_and_a_limit() {
     let found = found(&mut map(1500, wall, &[], |_, _| false));
     assert!(found.list.defects.is_empty(), "{:#?}", found.list.defects);
     let limit = found.list.detection_limit_mm;
-    assert!(limit >= 0.5 && limit < 1.5, "{limit}");
+    assert!((0.5..1.5).contains(&limit), "{limit}");
 }
 
 #[test]

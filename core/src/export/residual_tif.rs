@@ -176,7 +176,9 @@ mod tests {
     fn what_was_written_is_read_in_any_window() {
         let folder = tempfile::tempdir().expect("temporary folder");
         let (columns, rows) = (700, 530);
-        let value = |c: usize, r: usize| if (c / 90 + r / 70) % 4 == 0 { f32::NAN } else { c as f32 * 0.25 - r as f32 };
+        let value = |c: usize, r: usize| {
+            if (c / 90 + r / 70).is_multiple_of(4) { f32::NAN } else { c as f32 * 0.25 - r as f32 }
+        };
         let mut writer = ResidualWriter::new(folder.path(), NAME);
         for first in [0, 400] {
             let some = if first == 0 { 400 } else { columns - 400 };

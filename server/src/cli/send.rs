@@ -60,7 +60,8 @@ pub(super) struct Send {
     /// The server's address
     #[arg(long, value_name = "URL", default_value = "http://127.0.0.1:8420", env = "STRIA_SERVER")]
     server: Url,
-    /// A file that holds the token; else the variable STRIA_TOKEN does
+    /// A file with the server's token, which only its owner may read [default: ~/.config/stria/token where it exists;
+    /// STRIA_TOKEN holds the token itself]
     #[arg(long, value_name = "FILE", env = "STRIA_TOKEN_FILE")]
     token_file: Option<PathBuf>,
     /// Most kilobits a second on the network [default: as fast as it goes]

@@ -8,7 +8,7 @@ use governor::{DefaultDirectRateLimiter, Quota, RateLimiter};
 use reqwest::header::{AUTHORIZATION, HeaderMap, HeaderValue};
 use reqwest::{Client, Method, RequestBuilder, Response, Url};
 
-use super::super::Failed;
+use super::super::{Failed, bearer};
 use super::trouble::{Trouble, trouble_of};
 
 /// Longest time to reach the server.
@@ -47,7 +47,7 @@ impl Contact {
         if !matches!(server.scheme(), "http" | "https") || server.host().is_none() {
             return Err(Failed::Input(format!("--server {server}: expected http://HOST:PORT or https://HOST")));
         }
-        let token = read_token(token_file)?;
+        let token = authorization(token_file)?;
         // Two libraries bring their own cryptography; the WebSocket's must be told which. A second word changes nothing.
         let _ = tokio_rustls::rustls::crypto::aws_lc_rs::default_provider().install_default();
         let mut headers = HeaderMap::new();
@@ -151,28 +151,11 @@ impl Limit {
     }
 }
 
-/// From the file that was named, else from STRIA_TOKEN.
-fn read_token(file: Option<&Path>) -> Result<Option<HeaderValue>, Failed> {
-    let (text, place) = match file {
-        Some(path) => {
-            let text = std::fs::read_to_string(path)
-                .map_err(|e| Failed::Input(format!("--token-file {}: {e}; expected a token", path.display())))?;
-            (text, format!("--token-file {}", path.display()))
-        }
-        None => (std::env::var("STRIA_TOKEN").unwrap_or_default(), "STRIA_TOKEN".into()),
-    };
-    let token = text.trim();
-    if token.is_empty() {
-        return match file {
-            Some(_) => Err(Failed::Input(format!("{place}: is empty; expected a token"))),
-            None => Ok(None),
-        };
-    }
-    let plain = token.bytes().all(|b| b.is_ascii_graphic());
-    let value = HeaderValue::from_str(&format!("Bearer {token}")).ok().filter(|_| plain);
-    let mut value = value.ok_or_else(|| {
-        Failed::Input(format!("{place}: holds more than a token; expected one line of letters, digits and signs"))
-    })?;
+/// The header that brings the token.
+fn authorization(file: Option<&Path>) -> Result<Option<HeaderValue>, Failed> {
+    let Some(token) = bearer::token(file)? else { return Ok(None) };
+    let mut value = HeaderValue::from_str(&format!("Bearer {token}"))
+        .map_err(|_| Failed::Input("the token has characters that no token has".into()))?;
     value.set_sensitive(true);
     Ok(Some(value))
 }

@@ -92,7 +92,9 @@ pub(super) fn of_status(status: StatusCode, problem: &Value, wait: Option<Durati
     let words = words_of(status, problem);
     let retryable = problem.get("retryable").and_then(Value::as_bool).unwrap_or(false);
     match status.as_u16() {
-        401 | 403 => Trouble::Denied(format!("the server does not let this sender in ({words})")),
+        401 | 403 => Trouble::Denied(format!(
+            "the server does not let this sender in ({words}); its token comes from STRIA_TOKEN or --token-file"
+        )),
         404 | 410 => Trouble::Gone(words),
         408 | 409 | 423 | 425 | 429 | 460 | 501..=599 => Trouble::Passing { why: words, wait, fault: false },
         500 => Trouble::Passing { why: words, wait, fault: true },
