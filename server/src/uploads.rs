@@ -153,7 +153,8 @@ impl Uploads {
         Ok(made)
     }
 
-    fn check_length(&self, length_bytes: Option<u64>) -> Result<()> {
+    /// A size that this server takes, where it is known.
+    pub fn check_length(&self, length_bytes: Option<u64>) -> Result<()> {
         match length_bytes {
             Some(bytes) if bytes > self.limits.upload_bytes => {
                 Err(Error::TooLarge { limit_bytes: self.limits.upload_bytes })

@@ -6,7 +6,7 @@ use std::process::Command;
 use stria_tests::support::eventually;
 use stria_tests::support::server::{Server, problem_of, send};
 
-use super::pieces::{assert_source, content, create, growing_file, offset, piece, runs, send_rest};
+use super::pieces::{assert_source, content, create, creation, growing_file, offset, piece, runs, send_rest};
 
 /// The upload, bytes.
 const BYTES: usize = 24_000_000;
@@ -15,11 +15,15 @@ const ROOM_BYTES: usize = 16_000_000;
 /// The disk, bytes.
 const DISK_BYTES: usize = 64_000_000;
 
-/// An upload that does not fit, then does. `make_room` may look at the server.
-fn fills_up(server: &Server, make_room: impl FnOnce(&Server)) {
+/// What the server keeps free of itself would be more than the whole disk.
+const FLAGS: [&str; 4] = ["--workers", "0", "--disk-reserve-gb", "0"];
+
+/// An upload that fits, then does not, then does.
+fn fills_up(server: &Server, fill: impl FnOnce(&Server), make_room: impl FnOnce(&Server)) {
     let content = content(BYTES, 41);
     let path = create(server, BYTES);
     send(piece(server, &path, 0).body(content[..1_000_000].to_vec()));
+    fill(server);
     let full = problem_of(send(piece(server, &path, 1_000_000).body(content[1_000_000..].to_vec())), 507);
     assert_eq!(full["retryable"], true, "{full:#}");
     let kept = offset(server, &path);
@@ -40,8 +44,9 @@ fn a_file_system_that_takes_no_larger_file() {
     let limit = format!("--fsize={ROOM_BYTES}:unlimited");
     let wrapper = ["prlimit", &limit, "env", "--ignore-signal=XFSZ"];
     let folder = tempfile::tempdir().expect("a temporary folder");
-    let server = Server::start_in(folder, &["--workers", "0"], &[], &wrapper);
-    fills_up(&server, |server| {
+    let server = Server::start_in(folder, &FLAGS, &[], &wrapper);
+    let nothing = |_: &Server| {};
+    fills_up(&server, nothing, |server| {
         let raised = Command::new("prlimit").args(["--fsize=unlimited", "--pid", &server.id().to_string()]).status();
         assert!(raised.expect("prlimit is there").success());
     });
@@ -58,12 +63,16 @@ fn a_disk_of_its_own_that_is_full() {
     let at = folder.path().to_str().expect("a plain path").to_string();
     let mount = format!("mount -t tmpfs -o size={DISK_BYTES} tmpfs {at} && exec \"$@\"");
     let wrapper = [unshare, &["sh", "-c", &mount, "sh"]].concat();
-    let server = Server::start_in(folder, &["--workers", "0"], &[], &wrapper);
+    let server = Server::start_in(folder, &FLAGS, &[], &wrapper);
     // Only the server's own world has the disk.
     let disk = PathBuf::from(format!("/proc/{}/root{at}", server.id()));
     let filler = disk.join("filler");
-    std::fs::write(&filler, vec![1; DISK_BYTES - ROOM_BYTES]).expect("there is room for it");
-    fills_up(&server, |_| std::fs::remove_file(&filler).expect("it goes"));
+    let fill = |server: &Server| {
+        std::fs::write(&filler, vec![1; DISK_BYTES - ROOM_BYTES]).expect("there is room for it");
+        // Who comes with more than there is room for hears so at once.
+        problem_of(send(creation(server).header("Upload-Length", BYTES)), 507);
+    };
+    fills_up(&server, fill, |_| std::fs::remove_file(&filler).expect("it goes"));
     let left = disk.join(growing_file(&server, "/x").strip_prefix(&at).expect("inside").parent().expect("a folder"));
     eventually("nothing of the upload is left", || !left.exists());
 }

@@ -250,6 +250,8 @@ async fn create(app: App, parts: Parts, body: Body) -> Result<Response> {
     {
         return Err(Error::TooLarge { limit_bytes: length });
     }
+    // What is too large for ever is said before what is too large for now.
+    app.uploads.check_length(length_bytes)?;
     app.disk.check(length_bytes.unwrap_or(0))?;
     let made = app.uploads.create(new, idempotency_key(headers)?.as_deref()).await?;
     let location = [(LOCATION, format!("/api/uploads/{}", made.id))];
