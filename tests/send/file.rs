@@ -205,6 +205,8 @@ fn the_token_is_in_the_header_and_nowhere_else() {
     let file = scene.robot.file("run.mp4", 3 * MB as usize, 11);
     let token_file = scene.robot.path("token");
     std::fs::write(&token_file, "from-a-file\n").expect("writes");
+    let own = std::os::unix::fs::PermissionsExt::from_mode(0o600);
+    std::fs::set_permissions(&token_file, own).expect("changes");
     let (url, rig) = (scene.relay.url(), plain(&short_run().rig));
     let usual = [plain(&file), "--server", &url, "--asset", "A", "--rig", rig, "--limit-kbit-s", "16000"];
     for (more, variables, expected) in [

@@ -142,6 +142,19 @@ impl BytesSoFar {
         }
     }
 
+    /// The promise could not be made, since another request owns the upload now, whose row is as given: a tail that it
+    /// does not name belongs to nobody.
+    pub(super) async fn drop_orphaned_tail(&mut self, row: Option<&upload::Model>) {
+        let Place::Bucket(parts) = &mut self.place else { return };
+        let orphan = std::mem::replace(&mut parts.kept, parts.promised);
+        if orphan.bytes == 0 || orphan == parts.promised || row.is_some_and(|row| Tail::of(row) == orphan) {
+            return;
+        }
+        if let Err(error) = parts.store.delete(&orphan.key(&parts.upload)).await {
+            tracing::debug!(%error, "a tail that belongs to nobody stays for now");
+        }
+    }
+
     /// Gives the room back of what is not promised: the disk may be full, and the records may be on it.
     pub(super) async fn drop_unpromised(self) {
         let Place::Folder { path, mut file, promised_bytes } = self.place else { return };

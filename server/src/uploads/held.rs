@@ -217,7 +217,14 @@ impl Receiving<'_> {
             tail_bytes: Set(progress.tail.bytes),
             ..Default::default()
         };
-        self.held.write(change, &progress.new_parts).await?;
+        if let Err(error) = self.held.write(change, &progress.new_parts).await {
+            if matches!(error, Error::Locked(_)) {
+                let id = &self.held.row.id;
+                let now = upload::Entity::find_by_id(id).one(self.held.uploads.db.read()).await?;
+                self.bytes.drop_orphaned_tail(now.as_ref()).await;
+            }
+            return Err(error);
+        }
         let row = &mut self.held.row;
         (row.offset_bytes, row.hash_state) = (progress.offset_bytes, progress.hash_state);
         (row.tail_fence, row.tail_number, row.tail_bytes) =
