@@ -6,6 +6,7 @@ Prints what the server says as JSON lines, and for each frame when it was sent: 
 
 import asyncio
 import json
+import os
 import struct
 import sys
 import time
@@ -24,7 +25,8 @@ def frame(seq, image):
 
 
 async def send_all(images, finished):
-    async with websockets.connect(URL, max_size=None) as socket:
+    doors = {"Authorization": f"Bearer {os.environ['STRIA_TOKEN']}"} if "STRIA_TOKEN" in os.environ else {}
+    async with websockets.connect(URL, max_size=None, additional_headers=doors) as socket:
         hello = {"type": "hello", "asset": ASSET, "rig": Path(RIG).read_text(), "fps": float(FPS), "resume": True}
         await socket.send(json.dumps(hello))
         welcome = json.loads(await socket.recv())
