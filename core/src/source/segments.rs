@@ -6,7 +6,7 @@
 //! | file | what |
 //! |---|---|
 //! | `segments` | `frames` or `ts`: what the segments hold |
-//! | `000000.frames` … | images with their times ([`frame_file`](super::frame_file)) |
+//! | `000000.frames` … | images with their times ([the form](super::frame_file)) |
 //! | `000000.ts` … | an MPEG transport stream, cut anywhere |
 //! | `000007.part` | segment 7 begins a new stream (the sender came back): its time of arrival, ns since 1970 |
 //! | `closed` | no further segments come |
