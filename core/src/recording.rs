@@ -79,8 +79,9 @@ mod entity {
 /// Most points of the newest profile that are shown.
 const NEWEST_POINTS: usize = 200;
 
-/// Longest time between two live segments while the robot still walks, s.
+/// Time between two live segments while the robot still walks, s, and how far it may grow on a long run.
 const WATCHED_SEGMENT_S: f64 = 0.25;
+const WATCHED_LONGEST: Duration = Duration::from_millis(500);
 
 /// Rows of plots that wait, at most, before they become a chunk.
 const ROWS_WAIT: usize = 512;
@@ -159,7 +160,8 @@ impl Recorder {
         let opening = blueprint::opening(&id, run.name, run.recorded_at)?;
         let longest_s = if run.watched { WATCHED_SEGMENT_S } else { 3600.0 };
         let period = Duration::from_secs_f64(options.segment_s.clamp(0.01, longest_s));
-        let live = segments_dir.map(|dir| LiveSegments::new(dir, period)).transpose()?;
+        let longest = if run.watched { WATCHED_LONGEST } else { Duration::MAX };
+        let live = segments_dir.map(|dir| LiveSegments::new(dir, period, longest)).transpose()?;
         let mut budget = Budget::new(options.budget_mb);
         let mut recorder = Recorder {
             store: RrdStore::create(id, opening, rrd, live)?,

@@ -100,6 +100,7 @@ test("the path's plots and every file of a finished run", async () => {
   await page.getByRole("tab", { name: "Files" }).click();
   await page.getByRole("link", { name: "Download depth.tif" }).waitFor();
   await page.getByRole("tab", { name: "Files" }).press("ArrowRight");
-  assert.equal(await page.evaluate(() => document.activeElement.textContent), "Measurements");
+  const focused = () => page.evaluate(() => document.activeElement.textContent);
+  await until("the arrow has gone on to the next part", 5_000, async () => (await focused()) === "Measurements");
   await close();
 });

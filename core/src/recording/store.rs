@@ -162,6 +162,8 @@ impl RrdStore {
 pub(super) struct LiveSegments {
     dir: PathBuf,
     period: Duration,
+    /// However much has been shown, people wait no longer than this.
+    longest: Duration,
     head: Vec<LogMsg>,
     messages: Vec<LogMsg>,
     bytes: u64,
@@ -170,11 +172,20 @@ pub(super) struct LiveSegments {
 }
 
 impl LiveSegments {
-    /// Segments in `dir`, one at most every `period`.
-    pub(super) fn new(dir: &Path, period: Duration) -> Result<LiveSegments> {
+    /// Segments in `dir`, one at most every `period`, which grows with what was shown up to `longest`.
+    pub(super) fn new(dir: &Path, period: Duration, longest: Duration) -> Result<LiveSegments> {
         std::fs::create_dir_all(dir).map_err(|e| Error::io(dir, e))?;
         let dir = dir.to_path_buf();
-        Ok(LiveSegments { dir, period, head: vec![], messages: vec![], bytes: 0, last: Instant::now(), next_number: 0 })
+        Ok(LiveSegments {
+            dir,
+            period,
+            longest,
+            head: vec![],
+            messages: vec![],
+            bytes: 0,
+            last: Instant::now(),
+            next_number: 0,
+        })
     }
 
     /// Every segment begins with the store's info, so that each can be read alone; the first has the blueprint too.
@@ -193,7 +204,9 @@ impl LiveSegments {
 
     fn due(&self, costs: &Share) -> bool {
         let first = self.next_number == 0;
-        first || self.bytes >= SEGMENT_BYTES || self.last.elapsed() >= self.period * (1 << costs.halvings().min(8))
+        first
+            || self.bytes >= SEGMENT_BYTES
+            || self.last.elapsed() >= (self.period * (1 << costs.halvings().min(8))).min(self.longest)
     }
 
     fn cut(&mut self, costs: &mut Share) -> Result<Option<Segment>> {
