@@ -14,6 +14,7 @@ use bytes::Bytes;
 use sea_orm::sea_query::Expr;
 use sea_orm::{
     ActiveValue::Set, ColumnTrait, Condition, ConnectionTrait, EntityTrait, ExprTrait, QueryFilter, QueryOrder,
+    QuerySelect,
 };
 use sha2_resumable::Sha256;
 use sha2_resumable::digest::Digest;
@@ -108,7 +109,7 @@ impl Live {
         let row = retried(ANSWER_PATIENCE, || self.begin(&hello)).await?;
         self.bell.ring();
         let hash = resumed_hash::read(&row.hash_state)?;
-        let missing = serde_json::from_str(&row.missing).unwrap_or_default();
+        let missing = read_gaps(&row)?;
         Ok(Connection {
             live: self.clone(),
             kind: hello.kind,
@@ -127,7 +128,7 @@ impl Live {
     /// The stream's row for a new connection: of its open run, or of a new one.
     async fn begin(&self, hello: &Hello) -> Result<stream::Model> {
         let t = self.db.write().await?;
-        let before = stream::Entity::find_by_id(&hello.stream).one(&*t).await?;
+        let before = stream::Entity::find_by_id(&hello.stream).lock_exclusive().one(&*t).await?;
         if let Some(row) = &before
             && row.is_open != 0
         {
@@ -177,13 +178,13 @@ impl Live {
     /// The streams, the latest first.
     pub async fn list(&self) -> Result<Vec<StreamState>> {
         let rows = stream::Entity::find().order_by_desc(stream::Column::OpenedMs).all(self.db.read()).await?;
-        Ok(rows.into_iter().map(said).collect())
+        rows.into_iter().map(said).collect()
     }
 }
 
-fn said(row: stream::Model) -> StreamState {
-    StreamState {
-        missing: serde_json::from_str(&row.missing).unwrap_or_default(),
+fn said(row: stream::Model) -> Result<StreamState> {
+    Ok(StreamState {
+        missing: read_gaps(&row)?,
         open: row.is_open != 0,
         frames: to_u64(row.frames),
         bytes: to_u64(row.bytes),
@@ -192,7 +193,13 @@ fn said(row: stream::Model) -> StreamState {
         job: row.job_id,
         kind: row.kind,
         opened_ms: row.opened_ms,
-    }
+    })
+}
+
+/// A list that cannot be read is no empty list.
+fn read_gaps(row: &stream::Model) -> Result<Vec<[u64; 2]>> {
+    serde_json::from_str(&row.missing)
+        .map_err(|e| Error::Internal(format!("the gaps of stream {} cannot be read: {e}", row.name)))
 }
 
 /// A frame that is not durable yet.

@@ -3,7 +3,7 @@
 use std::collections::HashMap;
 use std::time::Duration;
 
-use sea_orm::{ColumnTrait, Condition, EntityTrait, QueryFilter};
+use sea_orm::{ColumnTrait, Condition, EntityTrait, QueryFilter, QuerySelect};
 use tokio::time::Instant;
 use tokio_util::sync::CancellationToken;
 
@@ -58,7 +58,7 @@ async fn close_vanished(live: &Live, row: &stream::Model) -> Result<()> {
         .add(stream::Column::Fence.eq(row.fence))
         .add(stream::Column::Beat.eq(row.beat))
         .add(stream::Column::IsOpen.eq(1));
-    let Some(row) = stream::Entity::find().filter(silent).one(&*t).await? else { return Ok(()) };
+    let Some(row) = stream::Entity::find().filter(silent).lock_exclusive().one(&*t).await? else { return Ok(()) };
     close_run(&*t, &row).await?;
     t.commit().await?;
     tracing::info!(stream = row.name, run = row.run_id, "the robot did not come back; its run is closed");
