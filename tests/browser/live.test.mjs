@@ -1,6 +1,8 @@
 // A run that is being measured grows on the page, without a reload, and catches up after the link was cut.
 
 import assert from "node:assert/strict";
+import { spawn } from "node:child_process";
+import { readFile } from "node:fs/promises";
 import { after, before, test } from "node:test";
 import { setTimeout as sleep } from "node:timers/promises";
 import { getJson, jobEnds, keepPicture, openPage, sendRun, simulate, startBrowser, startServer, until } from "./support.mjs";
@@ -21,11 +23,25 @@ after(async () => {
 const end = (page) => page.locator(".map-top").evaluate((element) => element.striaMap.bounds?.right ?? 0);
 const frame = (page) => page.locator(".live-picture canvas").getAttribute("data-frame").then(Number);
 
-/** A recipe that takes its time over each frame, so that there is something to watch on any machine. */
-const SLOW = 'method = "paper"\n[map]\ntile_frames = 15\n';
+const RECIPE = 'method = "paper"\n[map]\ntile_frames = 15\n';
+
+/** A robot that walks at half its pace, so that the run outlasts the test however fast the machine is; `stop` ends it. */
+async function walk(stream, fields) {
+  const rig = await readFile(run.rig, "utf8");
+  const address = new URL(`/api/live/${stream}?${new URLSearchParams({ rig, ...fields })}`, server.url);
+  const quiet = ["-hide_banner", "-loglevel", "error", "-nostdin"];
+  const robot = spawn("ffmpeg", [...quiet, "-readrate", "0.5", "-i", run.video, "-q:v", "3", "-f", "mpjpeg", "-method", "POST", address.href]);
+  const ended = new Promise((done, fail) => robot.once("exit", done).once("error", (error) => fail(new Error(`ffmpeg, which \`make setup\` installs: ${error.message}`))));
+  const known = await Promise.race([ended.then(() => assert.fail("ffmpeg ended at once")), until("the robot is seen", 20_000, async () => (await getJson(server, "/api/live")).items.find((item) => item.stream === stream))]);
+  const stop = async () => {
+    robot.kill("SIGKILL");
+    await ended;
+  };
+  return { job: known.job, stop };
+}
 
 test("frame, line, health and map grow; a cut of 20 s is caught up with", async () => {
-  const sent = await sendRun(server, run, { asset: "watched", recipe: SLOW });
+  const robot = await walk("walker", { asset: "watched", recipe: RECIPE });
   const { page, context, close } = await openPage(browser, server);
   await page.goto("/live");
   await page.getByRole("link", { name: /^Watch watched/ }).click();
@@ -47,14 +63,15 @@ test("frame, line, health and map grow; a cut of 20 s is caught up with", async 
   await page.getByText("The connection to the server was lost").or(page.getByText("Cut: trying again")).first().waitFor({ timeout: CUT_MS });
   await sleep(CUT_MS);
   const cutEnd = await end(page);
-  assert.equal((await getJson(server, `/api/jobs/${sent.job.id}`)).state, "running", "the run outlasts the cut");
+  assert.equal((await getJson(server, `/api/jobs/${robot.job}`)).state, "running", "the run outlasts the cut");
   await context.setOffline(false);
   await until("the map has caught up", 30_000, async () => (await end(page)) > cutEnd + 20);
   assert.ok(cutEnd >= grownEnd);
   await page.getByText("Connected").waitFor();
   await keepPicture(page, "live-after-cut");
-  await fetch(new URL(`/api/jobs/${sent.job.id}/cancel`, server.url), { method: "POST" });
+  await fetch(new URL(`/api/jobs/${robot.job}/cancel`, server.url), { method: "POST" });
   await page.getByText("Somebody cancelled this job").waitFor({ timeout: 20_000 });
+  await robot.stop();
   await close();
 });
 

@@ -228,6 +228,8 @@ export const runTexts = {
       "trajectory.csv": "The robot's path, a line per frame, for spreadsheets",
       "defects.csv": "List of defects, for spreadsheets",
       "defects.json": "List of defects, for programs",
+      "residual.tif": "How far the wall lies from its even shape, in millimetres, for GIS and measuring programs",
+      "sections.csv": "Size and ovality of a pipe or flatness of a wall along the way, for spreadsheets",
       "stripes.npy": "Where the laser line was in every frame, for programs",
       "recording.rrd": "All steps and the surface, for the rerun viewer",
       "archive.mcap": "Everything in one file, for Foxglove and robot programs",
