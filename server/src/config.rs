@@ -144,9 +144,9 @@ impl Default for RequestLimits {
 pub struct UploadLimits {
     /// Largest upload, bytes.
     pub upload_bytes: u64,
-    /// Received bytes are made durable and promised after so many of them …
-    pub sync_bytes: u64,
-    /// … or after this time.
+    /// Most received bytes that are not made durable and promised yet, apart from what lies in buffers …
+    pub unpromised_bytes: u64,
+    /// … and how long they may be so while more comes.
     pub sync_every: Duration,
     /// How long a request waits for the one before it to let go of an upload.
     pub takeover: Duration,
@@ -168,7 +168,7 @@ impl Default for UploadLimits {
     fn default() -> Self {
         UploadLimits {
             upload_bytes: 64 * GB,
-            sync_bytes: 8 << 20,
+            unpromised_bytes: 16 << 20,
             sync_every: Duration::from_secs(1),
             takeover: Duration::from_secs(3),
             kept_for: Duration::from_secs(7 * 86_400),

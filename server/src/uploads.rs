@@ -5,6 +5,7 @@
 //! and is waited for. Between servers the row's fence does the same: an older request's next write finds it changed.
 
 mod bytes_so_far;
+mod growing_file;
 mod held;
 mod sweep;
 

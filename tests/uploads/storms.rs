@@ -17,7 +17,7 @@ use super::pieces::{authority, fields, metadata, runs, server, source_sha256};
 use super::tunnel::{Tunnel, Weather};
 
 /// What a server may lose of what arrived and was not confirmed yet, bytes: its sync interval (`UploadLimits`).
-pub(super) const SYNC_BYTES: u64 = 8 << 20;
+pub(super) const SYNC_BYTES: u64 = 16 << 20;
 
 /// A large upload, bytes.
 const FILE_BYTES: usize = 200_000_000;

@@ -379,7 +379,7 @@ async fn take_in(
                 if let Some(checksum) = checksum {
                     checksum.update(&chunk);
                 }
-                receiving.push(&chunk).await?;
+                receiving.push(chunk).await?;
             }
             (Ok(None), _) => return Ok(Ok(())),
             (Err(_), Some((reason, _))) => return Ok(Err(Error::from(reason))),

@@ -1,15 +1,15 @@
 //! The bytes of an upload: in a folder a file that grows; on S3 a multipart upload, with what does not fill a part yet
-//! kept as an object of its own. Only what [`BytesSoFar::make_durable`] answered may be promised.
+//! kept as an object of its own. Only what is durable may be promised: [`BytesSoFar::make_durable`] waits for it,
+//! [`BytesSoFar::becomes_durable`] leaves that to others.
 
-use std::io::SeekFrom;
-use std::path::{Path, PathBuf};
+use std::path::PathBuf;
 
 use bytes::Bytes;
+use sea_orm::ActiveValue::Set;
 use sha2_resumable::Sha256;
 use sha2_resumable::digest::Digest;
-use tokio::fs::File;
-use tokio::io::{AsyncSeekExt, AsyncWriteExt};
 
+use super::growing_file::GrowingFile;
 use super::{gone, to_i64, to_u64};
 use crate::db::tables::upload;
 use crate::error::{Error, Result};
@@ -24,7 +24,7 @@ pub(super) struct BytesSoFar {
 }
 
 enum Place {
-    Folder { path: PathBuf, file: File, promised_bytes: u64 },
+    Folder { file: GrowingFile, promised_bytes: u64 },
     Bucket(Box<Parts>),
 }
 
@@ -72,6 +72,20 @@ pub(super) struct Progress {
     pub(super) new_parts: Vec<(i64, String)>,
 }
 
+impl Progress {
+    /// The row's change that promises it.
+    pub(super) fn change(&self) -> upload::ActiveModel {
+        upload::ActiveModel {
+            offset_bytes: Set(self.offset_bytes),
+            hash_state: Set(self.hash_state.clone()),
+            tail_fence: Set(self.tail.fence),
+            tail_number: Set(self.tail.number),
+            tail_bytes: Set(self.tail.bytes),
+            ..Default::default()
+        }
+    }
+}
+
 impl BytesSoFar {
     /// Opens them as the row promises them: what came after that and was not promised is dropped.
     pub(super) async fn open(store: &Store, row: &upload::Model, parts: Vec<String>) -> Result<BytesSoFar> {
@@ -79,8 +93,8 @@ impl BytesSoFar {
         let hash = resumed_hash::read(&row.hash_state)?;
         let place = match file_of(store, row) {
             Some(path) => {
-                let file = open_file(store, &path, offset_bytes).await?;
-                Place::Folder { path, file, promised_bytes: offset_bytes }
+                let file = GrowingFile::open(store, path, offset_bytes).await?;
+                Place::Folder { file, promised_bytes: offset_bytes }
             }
             None => Place::Bucket(Box::new(Parts::open(store, row, parts).await?)),
         };
@@ -92,29 +106,45 @@ impl BytesSoFar {
         self.offset_bytes
     }
 
-    pub(super) async fn push(&mut self, chunk: &[u8]) -> Result<()> {
-        match &mut self.place {
-            Place::Folder { path, file, .. } => file.write_all(chunk).await.map_err(|e| Error::io(path, e))?,
-            Place::Bucket(parts) => parts.push(chunk).await?,
-        }
-        self.hash.update(chunk);
+    pub(super) async fn push(&mut self, chunk: Bytes) -> Result<()> {
+        self.hash.update(&chunk);
         self.offset_bytes += chunk.len() as u64;
-        Ok(())
+        match &mut self.place {
+            Place::Folder { file, .. } => file.push(chunk).await,
+            Place::Bucket(parts) => parts.push(&chunk).await,
+        }
     }
 
-    /// Makes all of it durable.
-    pub(super) async fn make_durable(&mut self) -> Result<Progress> {
-        let mut progress = Progress {
+    fn progress(&self) -> Progress {
+        Progress {
             offset_bytes: to_i64(self.offset_bytes),
             hash_state: resumed_hash::write(&self.hash),
             tail: Tail { fence: 0, number: 0, bytes: 0 },
             new_parts: Vec::new(),
-        };
+        }
+    }
+
+    /// In a folder: what there is now will be durable when the future ends, while more is pushed.
+    pub(super) async fn becomes_durable(
+        &mut self,
+    ) -> Result<Option<(Progress, impl Future<Output = Result<()>> + Send + use<>)>> {
+        let progress = self.progress();
         match &mut self.place {
-            Place::Folder { path, file, .. } => {
-                let failed = |e| Error::io(path.as_path(), e);
-                file.flush().await.map_err(failed)?;
-                file.sync_data().await.map_err(failed)?;
+            Place::Folder { file, .. } => {
+                file.written().await?;
+                Ok(Some((progress, file.synced())))
+            }
+            Place::Bucket(_) => Ok(None),
+        }
+    }
+
+    /// Makes all of it durable.
+    pub(super) async fn make_durable(&mut self) -> Result<Progress> {
+        let mut progress = self.progress();
+        match &mut self.place {
+            Place::Folder { file, .. } => {
+                file.written().await?;
+                file.synced().await?;
             }
             Place::Bucket(parts) => {
                 parts.keep_tail().await?;
@@ -124,10 +154,10 @@ impl BytesSoFar {
         Ok(progress)
     }
 
-    /// What was made durable is promised now: what it replaces goes.
-    pub(super) async fn promised(&mut self) {
+    /// So many bytes, which were made durable, are promised now: what they replace goes.
+    pub(super) async fn promised(&mut self, offset_bytes: i64) {
         match &mut self.place {
-            Place::Folder { promised_bytes, .. } => *promised_bytes = self.offset_bytes,
+            Place::Folder { promised_bytes, .. } => *promised_bytes = to_u64(offset_bytes),
             Place::Bucket(parts) => {
                 parts.new_parts.clear();
                 let old = std::mem::replace(&mut parts.promised, parts.kept);
@@ -157,48 +187,9 @@ impl BytesSoFar {
 
     /// Gives the room back of what is not promised: the disk may be full, and the records may be on it.
     pub(super) async fn drop_unpromised(self) {
-        let Place::Folder { path, mut file, promised_bytes } = self.place else { return };
-        // A write that still runs would make the file longer again.
-        let _ = file.flush().await;
-        if let Err(error) = file.set_len(promised_bytes).await {
-            tracing::warn!(%error, path = %path.display(), "what was not promised of an upload stays for now");
-        }
-    }
-}
-
-async fn open_file(store: &Store, path: &Path, offset_bytes: u64) -> Result<File> {
-    let failed = |e| Error::io(path, e);
-    let mut file = open_or_make(path).await.map_err(failed)?;
-    let there = file.metadata().await.map_err(failed)?.len();
-    if there < offset_bytes {
-        return Err(Error::Internal(format!("{}: {there} bytes are left of {offset_bytes}", path.display())));
-    }
-    file.set_len(offset_bytes).await.map_err(failed)?;
-    file.seek(SeekFrom::Start(offset_bytes)).await.map_err(failed)?;
-    if offset_bytes == 0 {
-        // A file that is promised must have its name, too, and so must the folders above it.
-        let inside = |folder: &&Path| store.folder().is_some_and(|store| folder.starts_with(store));
-        let folders: Vec<PathBuf> = path.ancestors().skip(1).take_while(inside).map(Path::to_path_buf).collect();
-        let sync = move || folders.iter().try_for_each(|folder| std::fs::File::open(folder)?.sync_all());
-        let synced = tokio::task::spawn_blocking(sync).await;
-        synced.map_err(|e| Error::Internal(format!("file work stopped: {e}")))?.map_err(failed)?;
-    }
-    Ok(file)
-}
-
-/// Opens a file, or makes it with the folders above; a clean-up of empty folders beside us may take one away in between.
-async fn open_or_make(path: &Path) -> std::io::Result<File> {
-    const TRIES: usize = 5;
-    let mut tried = 0;
-    loop {
-        if let Some(folder) = path.parent() {
-            tokio::fs::create_dir_all(folder).await?;
-        }
-        let opened = File::options().write(true).create(true).truncate(false).open(path).await;
-        tried += 1;
-        match opened {
-            Err(e) if e.kind() == std::io::ErrorKind::NotFound && tried < TRIES => {}
-            other => return other,
+        let Place::Folder { file, promised_bytes } = self.place else { return };
+        if let Err(error) = file.cut(promised_bytes).await {
+            tracing::warn!(%error, "what was not promised of an upload stays for now");
         }
     }
 }

@@ -1,10 +1,12 @@
 //! An upload in the hands of one request.
 
+use bytes::Bytes;
 use sea_orm::{ActiveValue::Set, ColumnTrait, Condition, EntityTrait, QueryFilter, QueryOrder};
+use tokio::task::JoinHandle;
 use tokio::time::Instant;
 use tokio_util::sync::CancellationToken;
 
-use super::bytes_so_far::{self, BytesSoFar};
+use super::bytes_so_far::{self, BytesSoFar, Progress};
 use super::{TAKEN_OVER, Upload, Uploads, said, state, to_i64, to_u64};
 use crate::db::tables::{upload, upload_part};
 use crate::db::{ANSWER_PATIENCE, retried};
@@ -70,7 +72,8 @@ impl Held {
         }
         let parts = self.parts().await?;
         let bytes = BytesSoFar::open(&self.uploads.store, &self.row, parts).await?;
-        Ok(Receiving { held: self, bytes, all_or_nothing, since_commit: 0, committed_at: Instant::now() })
+        let promise = None;
+        Ok(Receiving { held: self, bytes, promise, all_or_nothing, since_commit: 0, committed_at: Instant::now() })
     }
 
     async fn parts(&self) -> Result<Vec<String>> {
@@ -84,31 +87,12 @@ impl Held {
 
     /// Writes to the row, unless another server took the upload over; it expires later for that.
     async fn write(&mut self, change: upload::ActiveModel, new_parts: &[(i64, String)]) -> Result<()> {
-        let expires_ms = self.uploads.expiry_ms();
-        let change = upload::ActiveModel { expires_ms: Set(expires_ms), ..change };
-        retried(ANSWER_PATIENCE, || self.try_write(change.clone(), new_parts)).await?;
-        self.row.expires_ms = expires_ms;
+        self.row.expires_ms = self.fenced().write(change, new_parts).await?;
         Ok(())
     }
 
-    async fn try_write(&self, change: upload::ActiveModel, new_parts: &[(i64, String)]) -> Result<()> {
-        let t = self.uploads.db.write().await?;
-        let mine = Condition::all()
-            .add(upload::Column::Id.eq(&self.row.id))
-            .add(upload::Column::Fence.eq(self.row.fence))
-            .add(upload::Column::State.eq(state::OPEN));
-        if upload::Entity::update_many().set(change).filter(mine).exec(&*t).await?.rows_affected == 0 {
-            return Err(Error::Locked(TAKEN_OVER.into()));
-        }
-        for (number, part) in new_parts {
-            let row = upload_part::ActiveModel {
-                upload_id: Set(self.row.id.clone()),
-                number: Set(*number),
-                part: Set(part.clone()),
-            };
-            upload_part::Entity::insert(row).exec_without_returning(&*t).await?;
-        }
-        t.commit().await
+    fn fenced(&self) -> Fenced {
+        Fenced { uploads: self.uploads.clone(), id: self.row.id.clone(), fence: self.row.fence }
     }
 
     /// Where all bytes are there: makes the run and its job, or says which it became before.
@@ -180,10 +164,49 @@ impl Held {
     }
 }
 
+/// The row under this request's fence.
+struct Fenced {
+    uploads: Uploads,
+    id: String,
+    fence: i64,
+}
+
+impl Fenced {
+    /// Writes to the row, unless another server took the upload over. Answers when it expires now, ms since 1970.
+    async fn write(&self, change: upload::ActiveModel, new_parts: &[(i64, String)]) -> Result<i64> {
+        let expires_ms = self.uploads.expiry_ms();
+        let change = upload::ActiveModel { expires_ms: Set(expires_ms), ..change };
+        retried(ANSWER_PATIENCE, || self.try_write(change.clone(), new_parts)).await?;
+        Ok(expires_ms)
+    }
+
+    async fn try_write(&self, change: upload::ActiveModel, new_parts: &[(i64, String)]) -> Result<()> {
+        let t = self.uploads.db.write().await?;
+        let mine = Condition::all()
+            .add(upload::Column::Id.eq(&self.id))
+            .add(upload::Column::Fence.eq(self.fence))
+            .add(upload::Column::State.eq(state::OPEN));
+        if upload::Entity::update_many().set(change).filter(mine).exec(&*t).await?.rows_affected == 0 {
+            return Err(Error::Locked(TAKEN_OVER.into()));
+        }
+        for (number, part) in new_parts {
+            let row = upload_part::ActiveModel {
+                upload_id: Set(self.id.clone()),
+                number: Set(*number),
+                part: Set(part.clone()),
+            };
+            upload_part::Entity::insert(row).exec_without_returning(&*t).await?;
+        }
+        t.commit().await
+    }
+}
+
 /// Bytes on their way into an upload. Ends with [`Receiving::commit`] or [`Receiving::drop_the_rest`].
 pub struct Receiving<'a> {
     held: &'a mut Held,
     bytes: BytesSoFar,
+    /// A promise that is being made while more comes.
+    promise: Option<(Progress, JoinHandle<Result<i64>>)>,
     all_or_nothing: bool,
     since_commit: u64,
     committed_at: Instant,
@@ -194,30 +217,55 @@ impl Receiving<'_> {
     ///
     /// # Errors
     /// [`Error::TooLarge`] where it goes past the upload's length: nothing of the chunk is taken.
-    pub async fn push(&mut self, chunk: &[u8]) -> Result<()> {
+    pub async fn push(&mut self, chunk: Bytes) -> Result<()> {
         let limit = self.held.row.length_bytes.map_or(self.held.uploads.limits.upload_bytes, to_u64);
         if self.bytes.offset_bytes() + chunk.len() as u64 > limit {
             return Err(Error::TooLarge { limit_bytes: limit });
         }
-        self.bytes.push(chunk).await?;
         self.since_commit += chunk.len() as u64;
+        self.bytes.push(chunk).await?;
         let limits = &self.held.uploads.limits;
-        let due = self.since_commit >= limits.sync_bytes || self.committed_at.elapsed() >= limits.sync_every;
-        if due && !self.all_or_nothing { self.commit().await } else { Ok(()) }
+        // One half is being promised while the other comes.
+        let due = self.since_commit >= limits.unpromised_bytes / 2 || self.committed_at.elapsed() >= limits.sync_every;
+        if due && !self.all_or_nothing { self.promise().await } else { Ok(()) }
+    }
+
+    /// Begins to promise what there is; where that cannot be done aside, does it now.
+    async fn promise(&mut self) -> Result<()> {
+        self.settle().await?;
+        let Some((progress, durable)) = self.bytes.becomes_durable().await? else { return self.commit().await };
+        let (row, change) = (self.held.fenced(), progress.change());
+        let made = tokio::spawn(async move {
+            durable.await?;
+            row.write(change, &[]).await
+        });
+        self.promise = Some((progress, made));
+        self.since_commit = 0;
+        self.committed_at = Instant::now();
+        Ok(())
+    }
+
+    /// The promise that is being made is made.
+    async fn settle(&mut self) -> Result<()> {
+        let Some((progress, made)) = self.promise.take() else { return Ok(()) };
+        let made = made.await.map_err(|e| Error::Internal(format!("an upload's task stopped: {e}")))?;
+        self.held.row.expires_ms = made?;
+        self.promised(progress).await;
+        Ok(())
+    }
+
+    async fn promised(&mut self, progress: Progress) {
+        let (row, tail) = (&mut self.held.row, progress.tail);
+        (row.offset_bytes, row.hash_state) = (progress.offset_bytes, progress.hash_state);
+        (row.tail_fence, row.tail_number, row.tail_bytes) = (tail.fence, tail.number, tail.bytes);
+        self.bytes.promised(progress.offset_bytes).await;
     }
 
     /// All of it is there, or what there is shall be kept: makes it durable, then promises it.
     pub async fn commit(&mut self) -> Result<()> {
+        self.settle().await?;
         let progress = self.bytes.make_durable().await?;
-        let change = upload::ActiveModel {
-            offset_bytes: Set(progress.offset_bytes),
-            hash_state: Set(progress.hash_state.clone()),
-            tail_fence: Set(progress.tail.fence),
-            tail_number: Set(progress.tail.number),
-            tail_bytes: Set(progress.tail.bytes),
-            ..Default::default()
-        };
-        if let Err(error) = self.held.write(change, &progress.new_parts).await {
+        if let Err(error) = self.held.write(progress.change(), &progress.new_parts).await {
             if matches!(error, Error::Locked(_)) {
                 let id = &self.held.row.id;
                 let now = upload::Entity::find_by_id(id).one(self.held.uploads.db.read()).await?;
@@ -225,18 +273,17 @@ impl Receiving<'_> {
             }
             return Err(error);
         }
-        let row = &mut self.held.row;
-        (row.offset_bytes, row.hash_state) = (progress.offset_bytes, progress.hash_state);
-        (row.tail_fence, row.tail_number, row.tail_bytes) =
-            (progress.tail.fence, progress.tail.number, progress.tail.bytes);
-        self.bytes.promised().await;
+        self.promised(progress).await;
         self.since_commit = 0;
         self.committed_at = Instant::now();
         Ok(())
     }
 
     /// What was not promised yet shall not count, or could not be kept.
-    pub async fn drop_the_rest(self) {
+    pub async fn drop_the_rest(mut self) {
+        if let Err(error) = self.settle().await {
+            tracing::debug!(%error, "the last promise of an upload was not made");
+        }
         self.bytes.drop_unpromised().await;
     }
 }
