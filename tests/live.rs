@@ -172,6 +172,12 @@ fn an_unmodified_ffmpeg_sends_mpeg_ts_and_the_surface_is_that_of_the_batch() {
         assert_eq!(job["frames"], 60, "{name}");
         assert_eq!(depth_map_sha256(&server, &text(&live, "/job")), batch_sha256(&server, &ts), "{name}");
     }
+    // Both are in the list, the latest first, page by page.
+    let first = server.json("/api/live?limit=1");
+    let cursor = text(&first, "/next_cursor");
+    let second = server.json(&format!("/api/live?limit=1&cursor={cursor}"));
+    assert_eq!((text(&first, "/items/0/stream"), text(&second, "/items/0/stream")), ("h265".into(), "h264".into()));
+    assert!(second["next_cursor"].is_null(), "{second:#}");
 }
 
 #[test]

@@ -192,6 +192,8 @@ pub struct LiveLimits {
     pub ack_every: Duration,
     /// A connection that brings nothing for this long is closed.
     pub silence: Duration,
+    /// How long a new connection waits for the one before it to let go of a stream.
+    pub takeover: Duration,
     /// A robot that vanished has this long to come back before its run is closed.
     pub come_back: Duration,
     /// Live streams at the same time in one process.
@@ -207,6 +209,7 @@ impl Default for LiveLimits {
             segment_bytes: 8 << 20,
             ack_every: Duration::from_millis(250),
             silence: Duration::from_secs(30),
+            takeover: Duration::from_secs(3),
             come_back: Duration::from_secs(60),
             streams_at_once: 16,
         }

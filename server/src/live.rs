@@ -8,7 +8,6 @@ mod watch;
 
 use std::collections::BTreeMap;
 use std::sync::Arc;
-use std::time::Duration;
 
 use bytes::Bytes;
 use sea_orm::sea_query::Expr;
@@ -31,7 +30,7 @@ use crate::db::{ANSWER_PATIENCE, Db, retried};
 use crate::error::{Error, Result};
 use crate::queue::{Bell, Queue};
 use crate::resumed_hash;
-use crate::runs::{NewRun, Runs, SourceRecord};
+use crate::runs::{NewRun, Page, Runs, SourceRecord};
 use crate::store::{Key, Store};
 use crate::turns::{Turn, Turns};
 use crate::wire::Priority;
@@ -104,8 +103,7 @@ impl Live {
     pub async fn open(&self, hello: Hello) -> Result<Connection> {
         check_stream_name(&hello.stream)?;
         hello.run.check()?;
-        let patience = self.limits.silence.min(Duration::from_secs(3));
-        let turn = self.turns.take(&hello.stream, patience).await?;
+        let turn = self.turns.take(&hello.stream, self.limits.takeover).await?;
         let row = retried(ANSWER_PATIENCE, || self.begin(&hello)).await?;
         self.bell.ring();
         let hash = resumed_hash::read(&row.hash_state)?;
@@ -175,10 +173,16 @@ impl Live {
         Ok(run.is_some_and(|run| run.asset == hello.run.asset && run.source_open != 0))
     }
 
-    /// The streams, the latest first.
-    pub async fn list(&self) -> Result<Vec<StreamState>> {
-        let rows = stream::Entity::find().order_by_desc(stream::Column::OpenedMs).all(self.db.read()).await?;
-        rows.into_iter().map(said).collect()
+    /// A page of the streams, those opened last first.
+    pub async fn list(&self, page: &Page) -> Result<(Vec<StreamState>, Option<String>)> {
+        // Names of runs grow with time.
+        let mut query = stream::Entity::find().order_by_desc(stream::Column::RunId).limit(page.limit + 1);
+        if let Some(cursor) = &page.cursor {
+            query = query.filter(stream::Column::RunId.lt(cursor.as_str()));
+        }
+        let mut rows = query.all(self.db.read()).await?;
+        let next_cursor = page.next(&mut rows, |row| row.run_id.clone());
+        Ok((rows.into_iter().map(said).collect::<Result<_>>()?, next_cursor))
     }
 }
 

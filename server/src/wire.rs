@@ -20,7 +20,7 @@ pub use lists::{
     Asset, AssetPage, Health, JobPage, LogPage, OptionRange, ProductPage, Recipe, RecipeOption, Rig, RigPage, RunPage,
     Worker,
 };
-pub use live::{LiveEnded, LiveStream, LiveStreams};
+pub use live::{LiveEnded, LiveStream, LiveStreamPage};
 pub use measure::{CrossSection, Trajectory};
 pub use retention::{Doomed, Pin, RetentionPreview};
 pub use run::{Direction, Run, RunChange, RunSource};

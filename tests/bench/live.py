@@ -21,6 +21,8 @@ ROOT = Path(__file__).resolve().parents[2]
 STRIA = ROOT / "target/release/stria"
 SENDER = ROOT / "tests/live/sender.py"
 FPS, SIZE, SECONDS = 30, "1280x720", 10
+# The job's last products must be there so long after the last frame.
+END_S = 600
 
 
 def simulate(folder):
@@ -117,9 +119,11 @@ def measure(server, walk, rig, frames, folder):
                 server_mb.append(memory_mb(server.pid, "VmRSS"))
         elif said.get("type") == "closed":
             closed = said
-    while json_of(f"{url}/api/jobs/{job}")["state"] in ("queued", "running"):
+    deadline = time.monotonic() + END_S
+    while (state := json_of(f"{url}/api/jobs/{job}"))["state"] in ("queued", "running"):
+        if time.monotonic() > deadline:
+            sys.exit(f"the job has not ended {END_S} s after the last frame: {state}")
         time.sleep(0.2)
-    state = json_of(f"{url}/api/jobs/{job}")
     time.sleep(1)
     latencies, shown = [], -1
     for number, at in seen:

@@ -18,7 +18,7 @@ from pathlib import Path
 
 ROOT = Path(__file__).resolve().parents[2]
 STRIA = ROOT / "target/release/stria"
-ROUNDS = 3
+ROUNDS = 5
 TUS = {"Tus-Resumable": "1.0.0"}
 
 
@@ -77,7 +77,7 @@ def main():
                 file.write(os.urandom(1_000_000))
         server = subprocess.Popen(
             [STRIA, "serve", "--listen", "127.0.0.1:0", "--data", folder / "data", "--workers", "0", "--without-authentication"],
-            stdout=subprocess.PIPE, text=True,
+            stdout=subprocess.PIPE, stderr=subprocess.DEVNULL, text=True,
         )
         try:
             url = server.stdout.readline().split()[-1].rstrip("/")

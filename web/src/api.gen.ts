@@ -414,7 +414,7 @@ export interface paths {
             path?: never;
             cookie?: never;
         };
-        /** The live streams, the latest first. */
+        /** The live streams, those opened last first. */
         get: operations["list_streams"];
         put?: never;
         post?: never;
@@ -1145,10 +1145,12 @@ export interface components {
             /** @description Its name. */
             stream: string;
         };
-        /** @description The live streams. */
-        LiveStreams: {
-            /** @description The latest first. */
+        /** @description A page of live streams, those opened last first. */
+        LiveStreamPage: {
+            /** @description The streams. */
             items: components["schemas"]["LiveStream"][];
+            /** @description Pass it as `cursor` for the next page; absent on the last. */
+            next_cursor?: string | null;
         };
         /** @description What `POST /api/session` takes. */
         LogIn: {
@@ -3355,7 +3357,12 @@ export interface operations {
     };
     list_streams: {
         parameters: {
-            query?: never;
+            query?: {
+                /** @description `next_cursor` of the page before. */
+                cursor?: string;
+                /** @description Most items, 1 to 1000; 50 when nothing is said. */
+                limit?: number;
+            };
             header?: never;
             path?: never;
             cookie?: never;
@@ -3367,7 +3374,15 @@ export interface operations {
                     [name: string]: unknown;
                 };
                 content: {
-                    "application/json": components["schemas"]["LiveStreams"];
+                    "application/json": components["schemas"]["LiveStreamPage"];
+                };
+            };
+            400: {
+                headers: {
+                    [name: string]: unknown;
+                };
+                content: {
+                    "application/problem+json": components["schemas"]["Problem"];
                 };
             };
             /** @description Nobody that this server knows */

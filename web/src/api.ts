@@ -173,7 +173,7 @@ export async function getTilesIndex(job: string): Promise<TilesIndex | null> {
 }
 
 /** The streams of robots that walk now, or did lately. */
-export const listStreams = async (): Promise<LiveStream[]> => (await json<Schemas["LiveStreams"]>("/api/live")).items;
+export const listStreams = async (): Promise<LiveStream[]> => (await json<Schemas["LiveStreamPage"]>("/api/live")).items;
 
 /** The newest frame of a job that runs: the stripe found in it, as `core/src/export/live_frame.rs` writes it. */
 export interface LiveFrame {

@@ -14,13 +14,13 @@ use stria_core::source::segments::SegmentKind;
 use tokio::time::Instant;
 
 use super::App;
-use super::extract::Path;
+use super::extract::{PageQuery, Path, Query};
 use super::form::{Body, Fields};
 use crate::error::{Error, Result};
 use crate::live::{Connection, Hello, StreamState};
 use crate::mjpeg::JpegSplitter;
 use crate::wire::time::to_text;
-use crate::wire::{LiveEnded, LiveStream, LiveStreams, Problem};
+use crate::wire::{LiveEnded, LiveStream, LiveStreamPage, Problem};
 
 /// Bytes of a binary message before its image: number, time, checksum.
 const FRAME_HEAD_BYTES: usize = 20;
@@ -37,11 +37,15 @@ const TS_SYNC: u8 = 0x47;
 /// So many packets in a row tell a transport stream.
 const TS_PACKETS: usize = 3;
 
-/// The live streams, the latest first.
-#[utoipa::path(get, path = "/api/live", tag = "live", responses((status = 200, body = LiveStreams)))]
-pub(super) async fn list_streams(State(app): State<App>) -> Result<Json<LiveStreams>> {
-    let items = app.live.list().await?.into_iter().map(shown).collect();
-    Ok(Json(LiveStreams { items }))
+/// The live streams, those opened last first.
+#[utoipa::path(get, path = "/api/live", tag = "live", params(PageQuery),
+    responses((status = 200, body = LiveStreamPage), (status = 400, body = Problem, content_type = "application/problem+json")))]
+pub(super) async fn list_streams(
+    State(app): State<App>,
+    Query(query): Query<PageQuery>,
+) -> Result<Json<LiveStreamPage>> {
+    let (items, next_cursor) = app.live.list(&query.page()?).await?;
+    Ok(Json(LiveStreamPage { items: items.into_iter().map(shown).collect(), next_cursor }))
 }
 
 fn shown(state: StreamState) -> LiveStream {

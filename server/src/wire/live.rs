@@ -26,11 +26,13 @@ pub struct LiveStream {
     pub opened_at: String,
 }
 
-/// The live streams.
+/// A page of live streams, those opened last first.
 #[derive(Clone, Debug, Serialize, ToSchema)]
-pub struct LiveStreams {
-    /// The latest first.
+pub struct LiveStreamPage {
+    /// The streams.
     pub items: Vec<LiveStream>,
+    /// Pass it as `cursor` for the next page; absent on the last.
+    pub next_cursor: Option<String>,
 }
 
 /// What a POST brought.
