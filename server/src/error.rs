@@ -29,6 +29,9 @@ pub enum Error {
     /// The thing's present state does not allow it.
     #[error("{0}")]
     Conflict(String),
+    /// It is no longer what the request was made from.
+    #[error("{0}")]
+    Changed(String),
     /// Somebody else is writing to it.
     #[error("{0}")]
     Locked(String),

@@ -345,13 +345,17 @@ impl Runs {
     }
 
     /// Changes what is said about a run.
-    pub async fn change(&self, id: &str, change: RunChange) -> Result<wire::Run> {
-        retried(ANSWER_PATIENCE, || self.try_change(id, change.clone())).await
+    /// `versions`: only where what is said has one of these versions; any where nothing is said.
+    pub async fn change(&self, id: &str, change: RunChange, versions: Option<&[String]>) -> Result<wire::Run> {
+        retried(ANSWER_PATIENCE, || self.try_change(id, change.clone(), versions)).await
     }
 
-    async fn try_change(&self, id: &str, change: RunChange) -> Result<wire::Run> {
+    async fn try_change(&self, id: &str, change: RunChange, versions: Option<&[String]>) -> Result<wire::Run> {
         let t = self.db.write().await?;
         let row = self.row_to_change(&*t, id).await?;
+        if versions.is_some_and(|versions| !versions.contains(&listing::version_of(&row))) {
+            return Err(Error::Changed("what is said about the run has changed since it was read".into()));
+        }
         let mut set = run::ActiveModel { id: Set(row.id), note: Set(row.note), ..Default::default() };
         if let Some(name) = change.asset {
             let name = name.trim().to_string();

@@ -3,7 +3,7 @@
 use std::io::{Read, Write};
 use std::net::TcpStream;
 
-use serde_json::Value;
+use serde_json::{Value, json};
 use stria_tests::support::server::{Server, header, json_of, problem_of, send, text};
 use stria_tests::support::short_run;
 
@@ -212,4 +212,23 @@ fn odd_requests_do_not_disturb_the_server() {
         assert!(line.contains(expected), "{line} instead of {expected} to {}", &request[..request.len().min(60)]);
     }
     assert_eq!(text(&server.json("/readyz"), "/status"), "ok");
+}
+
+#[test]
+fn what_is_said_about_a_run_changes_only_where_it_is_what_was_read() {
+    let server = Server::start(&["--workers", "0"]);
+    let run = server.upload(short_run(), "Wall");
+    let (path, version) = (format!("/api/runs/{}", text(&run, "/id")), text(&run, "/version"));
+    let change = |note: &str, versions: &str| {
+        send(server.patch(&path).header("If-Match", versions).json(&json!({ "note": note })))
+    };
+    let first = json_of(change("first", &format!("\"{version}\"")), 200);
+    assert_ne!(text(&first, "/version"), version);
+    let refused = problem_of(change("late", &format!("\"{version}\"")), 412);
+    assert_eq!(text(&refused, "/type"), "urn:stria:changed");
+    assert_eq!(text(&server.json(&path), "/note"), "first");
+    json_of(change("any", "*"), 200);
+    let now = text(&server.json(&path), "/version");
+    json_of(change("one of two", &format!("\"{version}\", \"{now}\"")), 200);
+    assert_eq!(text(&server.json(&path), "/note"), "one of two");
 }

@@ -1403,6 +1403,8 @@ export interface components {
             source: components["schemas"]["RunSource"];
             /** @description State of its latest job. */
             state: components["schemas"]["JobState"];
+            /** @description Another after every change of what is said about it; a PATCH that brings it as `If-Match` changes nothing else. */
+            version: string;
         };
         /** @description What can be changed about a run; absent fields stay as they are. */
         RunChange: {
@@ -4340,7 +4342,10 @@ export interface operations {
     change_run: {
         parameters: {
             query?: never;
-            header?: never;
+            header?: {
+                /** @description The run's `version`, quoted: changes nothing where it has another by now */
+                "If-Match"?: string | null;
+            };
             path: {
                 /** @description The run */
                 run: string;
@@ -4388,6 +4393,15 @@ export interface operations {
                 };
             };
             404: {
+                headers: {
+                    [name: string]: unknown;
+                };
+                content: {
+                    "application/problem+json": components["schemas"]["Problem"];
+                };
+            };
+            /** @description Somebody else has changed it */
+            412: {
                 headers: {
                     [name: string]: unknown;
                 };

@@ -74,6 +74,9 @@ pub(super) fn problem_of(error: Error) -> Problem {
         Error::Conflict(_) => {
             problem(StatusCode::CONFLICT, "conflict", "Its present state does not allow it", detail, false)
         }
+        Error::Changed(_) => {
+            problem(StatusCode::PRECONDITION_FAILED, "changed", "Somebody else has changed it", detail, false)
+        }
         Error::Locked(_) => problem(StatusCode::LOCKED, "locked", "Another request is writing to it", detail, true),
         Error::Gone(_) => problem(StatusCode::GONE, "gone", "It is no more", detail, false),
         Error::Checksum(_) => problem(checksum_mismatch(), "checksum-mismatch", "Not what was announced", detail, true),

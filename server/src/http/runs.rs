@@ -1,6 +1,7 @@
 //! Runs: list, read, change, delete, get the source back, process again.
 
 use axum::extract::State;
+use axum::http::header::IF_MATCH;
 use axum::http::{HeaderMap, Method, StatusCode};
 use axum::response::{IntoResponse, Response};
 use serde::Deserialize;
@@ -58,16 +59,31 @@ pub(super) async fn get_run(State(app): State<App>, Path(run): Path<String>) -> 
 }
 
 /// Changes what is said about a run.
-#[utoipa::path(patch, path = "/api/runs/{run}", tag = "runs", params(("run" = String, Path, description = "The run")),
+#[utoipa::path(patch, path = "/api/runs/{run}", tag = "runs",
+    params(("run" = String, Path, description = "The run"),
+        ("If-Match" = Option<String>, Header, description = "The run's `version`, quoted: changes nothing where it has another by now")),
     request_body = RunChange,
     responses((status = 200, body = Run), (status = 400, body = Problem, content_type = "application/problem+json"),
-        (status = 404, body = Problem, content_type = "application/problem+json")))]
+        (status = 404, body = Problem, content_type = "application/problem+json"),
+        (status = 412, body = Problem, content_type = "application/problem+json", description = "Somebody else has changed it")))]
 pub(super) async fn change_run(
     State(app): State<App>,
     Path(run): Path<String>,
+    headers: HeaderMap,
     Json(change): Json<RunChange>,
 ) -> Result<Response> {
-    Ok(axum::Json(app.runs.change(&run, change).await?).into_response())
+    let versions = wanted_versions(&headers);
+    Ok(axum::Json(app.runs.change(&run, change, versions.as_deref()).await?).into_response())
+}
+
+/// The versions that `If-Match` names; `None` where any will do.
+fn wanted_versions(headers: &HeaderMap) -> Option<Vec<String>> {
+    let said: Vec<&str> = headers.get_all(IF_MATCH).iter().filter_map(|v| v.to_str().ok()).collect();
+    let each = || said.iter().flat_map(|line| line.split(',')).map(str::trim);
+    if !headers.contains_key(IF_MATCH) || each().any(|v| v == "*") {
+        return None;
+    }
+    Some(each().map(|v| v.trim_matches('"').to_string()).collect())
 }
 
 /// Deletes a run with its jobs and all their files; a job that runs is stopped.

@@ -1,7 +1,7 @@
 //! Logging in and out with a browser: by a one-time address, or by a token.
 
 use axum::extract::{Extension, State};
-use axum::http::header::{CACHE_CONTROL, CONTENT_SECURITY_POLICY, CONTENT_TYPE, LOCATION, SET_COOKIE};
+use axum::http::header::{CACHE_CONTROL, CONTENT_SECURITY_POLICY, CONTENT_TYPE, LOCATION, REFERRER_POLICY, SET_COOKIE};
 use axum::http::{HeaderMap, HeaderValue, StatusCode, Uri};
 use axum::response::{IntoResponse, Response};
 use serde::Deserialize;
@@ -168,6 +168,8 @@ fn page(status: StatusCode, words: &str, next: Option<&str>) -> Response {
          <p>A token comes from whoever runs this server: <code>stria token create NAME --scopes read</code>.</p>"
     );
     let headers = [
+        // Without a referrer a browser would send the form from an origin called null, which is refused.
+        (REFERRER_POLICY, "same-origin"),
         (CONTENT_TYPE, "text/html; charset=utf-8"),
         (CACHE_CONTROL, "no-store"),
         (CONTENT_SECURITY_POLICY, PAGE_POLICY),

@@ -10,8 +10,12 @@ use super::{Runs, read_time, to_u64};
 use crate::db::tables::{asset, job, run, worker};
 use crate::error::{Error, Result};
 use crate::queue::state_of;
+use crate::store::sha256_of;
 use crate::wire::time::to_text;
 use crate::wire::{self, Direction, JobState, Priority};
+
+/// Digits of a run's version: more than enough to tell two of its states apart.
+const VERSION_CHARS: usize = 32;
 
 /// Which part of a list.
 #[derive(Clone, Debug)]
@@ -280,12 +284,21 @@ impl Runs {
     }
 }
 
+/// The version of what can be changed about a run.
+pub(super) fn version_of(row: &run::Model) -> String {
+    let said = (&row.asset, row.chainage_mm, &row.direction, row.recorded_ms, &row.note);
+    let mut version = sha256_of(&format!("{said:?}"));
+    version.truncate(VERSION_CHARS);
+    version
+}
+
 /// A run as the wire shows it.
 pub(super) fn run_of(row: run::Model, latest: Option<job::Model>) -> Result<wire::Run> {
     let latest = latest.ok_or_else(|| Error::NotFound { what: "run", id: row.id.clone() })?;
     let job = job_of(latest)?;
     let open = row.source_open != 0;
     Ok(wire::Run {
+        version: version_of(&row),
         source: wire::RunSource {
             filename: row.filename,
             open,

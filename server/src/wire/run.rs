@@ -69,6 +69,8 @@ pub struct Run {
     pub rig: String,
     /// The images.
     pub source: RunSource,
+    /// Another after every change of what is said about it; a PATCH that brings it as `If-Match` changes nothing else.
+    pub version: String,
     /// State of its latest job.
     pub state: JobState,
     /// Its latest job.
