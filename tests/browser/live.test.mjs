@@ -1,17 +1,16 @@
-// A run that is being measured grows on the page, without a reload, and catches up after the link was cut.
+// A run that is being measured grows on the page, without a reload, and catches up after the link was cut and after a sleep.
 
 import assert from "node:assert/strict";
-import { spawn } from "node:child_process";
-import { readFile } from "node:fs/promises";
 import { after, before, test } from "node:test";
 import { setTimeout as sleep } from "node:timers/promises";
-import { getJson, jobEnds, keepPicture, openPage, sendRun, simulate, startBrowser, startServer, until } from "./support.mjs";
+import { getJson, jobEnds, keepPicture, mapSettled, openPage, sendRun, simulate, startBrowser, startServer, throughDeafWay, until, walk } from "./support.mjs";
 
 const CUT_MS = 20_000;
+const ASLEEP_MS = 4000;
 let server, browser, run;
 
 before(async () => {
-  [server, run, browser] = await Promise.all([startServer(), simulate({ scene: "wall", seconds: 60 }), startBrowser()]);
+  [server, run, browser] = await Promise.all([startServer(["--live-come-back-s", "2"]), simulate({ scene: "wall", seconds: 60, size: "320x180" }), startBrowser()]);
 });
 after(async () => {
   await browser?.close();
@@ -25,24 +24,11 @@ const frame = (page) => page.locator(".live-picture canvas").getAttribute("data-
 
 const RECIPE = 'method = "paper"\n[map]\ntile_frames = 15\n';
 
-/** A robot that walks at half its pace, so that the run outlasts the test however fast the machine is; `stop` ends it. */
-async function walk(stream, fields) {
-  const rig = await readFile(run.rig, "utf8");
-  const address = new URL(`/api/live/${stream}?${new URLSearchParams({ rig, ...fields })}`, server.url);
-  const quiet = ["-hide_banner", "-loglevel", "error", "-nostdin"];
-  const robot = spawn("ffmpeg", [...quiet, "-readrate", "0.5", "-i", run.video, "-q:v", "3", "-f", "mpjpeg", "-method", "POST", address.href]);
-  const ended = new Promise((done, fail) => robot.once("exit", done).once("error", (error) => fail(new Error(`ffmpeg, which \`make setup\` installs: ${error.message}`))));
-  const known = await Promise.race([ended.then(() => assert.fail("ffmpeg ended at once")), until("the robot is seen", 20_000, async () => (await getJson(server, "/api/live")).items.find((item) => item.stream === stream))]);
-  const stop = async () => {
-    robot.kill("SIGKILL");
-    await ended;
-  };
-  return { job: known.job, stop };
-}
-
-test("frame, line, health and map grow; a cut of 20 s is caught up with", async () => {
-  const robot = await walk("walker", { asset: "watched", recipe: RECIPE });
-  const { page, context, close } = await openPage(browser, server);
+test("frame, line, health and map grow; a cut of 20 s and an hour's sleep are caught up with, and an end that nobody heard", async () => {
+  const robot = await walk(server, run, "walker", { asset: "watched", recipe: RECIPE });
+  const way = await throughDeafWay(server);
+  const { page, context, close } = await openPage(browser, way);
+  await page.clock.install();
   await page.goto("/live");
   await page.getByRole("link", { name: /^Watch watched/ }).click();
   await page.locator(".live-picture canvas[data-frame]").waitFor({ timeout: 60_000 });
@@ -69,10 +55,36 @@ test("frame, line, health and map grow; a cut of 20 s is caught up with", async 
   assert.ok(cutEnd >= grownEnd);
   await page.getByText("Connected").waitFor();
   await keepPicture(page, "live-after-cut");
-  await fetch(new URL(`/api/jobs/${robot.job}/cancel`, server.url), { method: "POST" });
-  await page.getByText("Somebody cancelled this job").waitFor({ timeout: 20_000 });
-  await robot.stop();
+  assert.equal(await page.getByText(/^0\s%$/).count(), 0, "nobody knows how long a stream will be");
+
+  // The lid is shut for an hour: the page stands still, its connections die without a word, its clock goes on.
+  const cdp = await context.newCDPSession(page);
+  const sleeps = async (during) => {
+    await cdp.send("Page.setWebLifecycleState", { state: "frozen" });
+    await during();
+    await cdp.send("Page.setWebLifecycleState", { state: "active" });
+    await page.clock.fastForward("01:00:00");
+  };
+  const [beforeSleep, frameBefore] = [await end(page), await frame(page)];
+  await sleeps(async () => {
+    assert.ok(way.deafen() > 0, "there was a connection to lose");
+    await sleep(ASLEEP_MS);
+  });
+  await until("the map has caught up after the sleep", 30_000, async () => (await end(page)) > beforeSleep + 20);
+  await until("the frames have, too", 30_000, async () => (await frame(page)) > frameBefore);
+
+  // The run ends while nobody hears it.
+  await sleeps(async () => {
+    way.deafen();
+    await robot.stop();
+    await jobEnds(server, robot.job);
+  });
+  await page.getByRole("tab", { name: "Files" }).waitFor({ timeout: 30_000 });
+  await page.locator(".glance").waitFor();
+  await mapSettled(page);
+  await keepPicture(page, "live-after-sleep");
   await close();
+  way.stop();
 });
 
 test("the end of a run is seen without a reload: the live part becomes the finished map", async () => {

@@ -3,7 +3,7 @@
 import assert from "node:assert/strict";
 import { gzipSync } from "node:zlib";
 import { after, before, test } from "node:test";
-import { jobEnds, keepPicture, mapSettled, measuredRun, openPage, seriousViolations, sendRun, simulate, startBrowser, startServer, until } from "./support.mjs";
+import { getJson, jobEnds, keepPicture, mapSettled, measuredRun, openPage, seriousViolations, sendRun, simulate, startBrowser, startServer, until } from "./support.mjs";
 
 const SIZES = [
   { width: 1440, height: 900 },
@@ -11,14 +11,17 @@ const SIZES = [
   { width: 360, height: 740 },
 ];
 const FIRST_PAGE_BYTES = 200_000;
-let server, empty, browser, run, other, first, second;
+let server, empty, browser, run, other, first, second, batch;
 
 before(async () => {
   [server, empty, run, other, browser] = await Promise.all([startServer(), startServer(["--workers", "0"]), simulate(), simulate({ scene: "wall", seed: 2 }), startBrowser()]);
   first = await measuredRun(server, run, { asset: "a-name-without-any-space-".repeat(6) });
   second = await measuredRun(server, other, { asset: "Sewer 12, north", chainage_mm: "12500" });
-  const again = await fetch(new URL(`/api/runs/${second.id}/jobs`, server.url), { method: "POST", headers: { "content-type": "application/json" }, body: JSON.stringify({ recipe: "paper" }) });
-  await jobEnds(server, (await again.json()).id);
+  const post = async (path, body) => (await fetch(new URL(path, server.url), { method: "POST", headers: { "content-type": "application/json" }, body: JSON.stringify(body) })).json();
+  batch = await post("/api/batches", { runs: [second.id], recipe: "paper", note: "The publication's way" });
+  await post("/api/tokens", { name: "robot 7", scopes: ["ingest", "read"] });
+  const made = await until("the batch has its job", 20_000, async () => (await getJson(server, `/api/jobs?run=${second.id}`)).items.find((job) => job.batch === batch.id));
+  await jobEnds(server, made.id);
   // Two that cannot be measured: states and errors are part of the look.
   const bad = await sendRun(server, { ...run, video: run.rig }, { filename: "notes.mp4", asset: "Sewer 12, north" });
   await jobEnds(server, bad.job.id, "failed");
@@ -74,8 +77,19 @@ test("the empty pages teach what to do", async () => {
 test("the lists, sending, queue and settings", async () => {
   await everyLook(server, "runs", "/", (page) => page.locator(".state.done").first().waitFor());
   await everyLook(server, "send", "/send", (page) => page.getByText("Choose files").last().waitFor());
-  await everyLook(server, "queue", "/queue", (page) => page.getByText("Failed").first().waitFor());
+  await everyLook(server, "queue", "/queue", async (page) => {
+    await page.getByText("Failed").first().waitFor();
+    await page.getByText("Measure many runs again").click();
+    await page.getByText("Count the runs").waitFor();
+  });
   await everyLook(server, "rigs", "/settings/rigs", (page) => page.locator(".rig-drawing svg").first().waitFor());
+  await everyLook(server, "tokens", "/settings/tokens", (page) => page.getByRole("region", { name: "Tokens" }).getByText("robot 7", { exact: true }).waitFor());
+  await everyLook(server, "retention", "/settings/retention", async (page) => {
+    await page.getByLabel("Keep for, days").fill("0");
+    await page.getByRole("button", { name: "Show what would go" }).click();
+    await page.getByRole("button", { name: /^Pin the run/ }).first().waitFor();
+  });
+  await everyLook(server, "batch", `/batches/${batch.id}`, (page) => page.locator("td[data-difference]").first().waitFor());
   await everyLook(server, "recipes", "/settings/recipes", (page) => page.getByText("spot.choice").first().waitFor());
 });
 
@@ -115,19 +129,22 @@ test("times are local and carry UTC", async () => {
   await close();
 });
 
-/** Looks at a page in all sizes and schemes: keeps a picture, checks what a program can check. */
+/** Looks at a page in all sizes and schemes: keeps a picture, checks what a program can check. It is loaded once and then changes, as when a tablet is turned. */
 async function everyLook(at, name, address, ready) {
+  const { page, close } = await openPage(browser, at, { viewport: SIZES[0] });
+  await page.goto(address);
+  await ready(page);
   for (const colorScheme of ["light", "dark"]) {
     for (const viewport of SIZES) {
       const look = `${name}-${viewport.width}-${colorScheme}`;
-      const { page, close } = await openPage(browser, at, { colorScheme, viewport });
-      await page.goto(address);
-      await ready(page);
+      await page.emulateMedia({ colorScheme });
+      await page.setViewportSize(viewport);
+      for (const map of await page.locator(".map-panel").all()) await mapSettled(page, map);
       await until("pictures are loaded", 10_000, () => page.evaluate(() => [...document.images].every((image) => image.complete || image.loading === "lazy")));
       await keepPicture(page, look);
       assert.equal(await page.evaluate(() => document.documentElement.scrollWidth - innerWidth), 0, `${look}: nothing sticks out to the side`);
       assert.deepEqual(await seriousViolations(page), [], look);
-      await close();
     }
   }
+  await close();
 }

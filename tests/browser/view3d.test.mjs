@@ -9,7 +9,7 @@ import { after, before, test } from "node:test";
 import { setTimeout as sleep } from "node:timers/promises";
 import { fileURLToPath } from "node:url";
 import { promisify } from "node:util";
-import { getJson, jobEnds, keepPicture, openPage, sendRun, simulate, startBrowser, startServer, until } from "./support.mjs";
+import { getJson, jobEnds, keepPicture, openPage, sendRun, simulate, startBrowser, startServer, until, walk } from "./support.mjs";
 
 const rerun = path.resolve(path.dirname(fileURLToPath(import.meta.url)), "../../target/python/bin/rerun");
 const DONE_MS = 120_000;
@@ -22,7 +22,7 @@ const SURFACE_TIMES = 5;
 let server, browser;
 
 before(async () => {
-  [server, browser] = await Promise.all([startServer(), startBrowser()]);
+  [server, browser] = await Promise.all([startServer(["--live-come-back-s", "2"]), startBrowser()]);
 });
 after(async () => {
   await browser?.close();
@@ -63,19 +63,21 @@ test("a finished run: the surface is on the canvas, and its pixels are the surfa
 });
 
 test("a run that is being measured: the surface is on the canvas before the job has ended", async () => {
-  const run = await simulate({ seconds: 90 });
+  const run = await simulate({ seconds: 30 });
+  const robot = await walk(server, run, "walker", { asset: "seen in 3D" });
   const { page, close } = await openPage(browser, server);
-  await send(page, run);
+  await page.goto(`/runs/${robot.run}?tab=space`);
   await page.getByRole("button", { name: "Open 3D view" }).click();
   await page.getByText(/^Live: \d+ parts? received/).waitFor({ timeout: SHOWN_MS });
   const share = await until("the surface shows while the job runs", DONE_MS, async () => {
     const now = await colouredShare(page);
-    const { job } = await getJson(server, `/api/runs/${new URL(page.url()).pathname.split("/").at(-1)}`);
+    const { job } = await getJson(server, `/api/runs/${robot.run}`);
     assert.equal(job.state, "running", `the job ended before its surface was seen (share ${now})`);
     return now > SURFACE_SHARE / 4 && now;
   });
   assert.ok(share > 0);
   await keepPicture(page.locator(".view").first(), "view3d-live");
+  await robot.stop();
   await page.getByText("The whole recording is shown").waitFor({ timeout: DONE_MS });
   await run.remove();
   await close();

@@ -61,12 +61,94 @@ test("the queue: what waits is cancelled and taken up again", async () => {
   const row = page.getByRole("region", { name: "Waiting" }).getByRole("listitem").filter({ hasText: "waits for long" });
   await row.getByText("No worker is there.").waitFor();
   await row.getByRole("button", { name: "Cancel" }).click();
-  const ended = page.getByRole("region", { name: "Ended lately" }).getByRole("listitem").filter({ hasText: "waits for long" });
+  const ended = page.getByRole("region", { name: "Cancelled" }).getByRole("listitem").filter({ hasText: "waits for long" });
   await ended.getByText("Cancelled").waitFor();
   assert.equal((await getJson(idle, `/api/jobs/${waiting.job.id}`)).state, "cancelled");
   await ended.getByRole("button", { name: "Try again" }).click();
   await row.waitFor();
   assert.equal((await getJson(idle, `/api/jobs/${waiting.job.id}`)).state, "queued");
+  await close();
+});
+
+test("what could not be measured says why, and can be tried again", async () => {
+  const sent = await sendRun(server, { ...run, video: run.rig }, { filename: "notes.mp4", asset: "no video at all" });
+  const failed = await jobEnds(server, sent.job.id, "failed");
+  const { page, close } = await openPage(browser, server);
+  await page.goto("/queue");
+  const row = page.getByRole("region", { name: "Failed" }).getByRole("listitem").filter({ hasText: "no video at all" });
+  await row.getByText(failed.error.detail).waitFor();
+  await row.getByText(/^Given up after 1 attempt/).waitFor();
+  const worker = page.getByRole("region", { name: "Workers" }).getByRole("listitem");
+  await worker.getByText(/of \d+ places taken/).first().waitFor();
+  await row.getByRole("button", { name: "Try again" }).click();
+  await until("it was tried again", 30_000, async () => {
+    const now = await getJson(server, `/api/jobs/${sent.job.id}`);
+    return now.state === "failed" && now.finished_at !== failed.finished_at;
+  });
+  await close();
+});
+
+test("a batch: counted beforehand, made, and laid beside what was there", async () => {
+  const { page, close } = await openPage(browser, server);
+  await page.goto("/?asset=test%20wall");
+  await page.getByRole("link", { name: "Measure these again" }).click();
+  const batches = page.getByRole("region", { name: "Batches" });
+  assert.equal(await batches.getByRole("combobox", { name: "Asset", exact: true }).inputValue(), "test wall");
+  assert.ok(await batches.getByRole("button", { name: "Measure again" }).isDisabled(), "nobody starts what was not counted");
+  await batches.getByLabel("Asset, file, rig or note").fill("no such words");
+  await batches.getByRole("button", { name: "Count the runs" }).click();
+  await batches.getByText("No run fits.").waitFor();
+  await batches.getByLabel("Asset, file, rig or note").fill("");
+  await batches.getByRole("combobox", { name: "Recipe", exact: true }).selectOption("paper");
+  await batches.getByLabel("Note", { exact: true }).fill("the publication's way");
+  await batches.getByRole("button", { name: "Count the runs" }).click();
+  await batches.getByText("1 run fits.").waitFor();
+  await keepPicture(page, "batch-counted");
+  assert.equal((await getJson(server, "/api/batches")).items.length, 0, "counting makes nothing");
+  await batches.getByRole("button", { name: "Measure 1 run again" }).click();
+  const row = batches.getByRole("listitem").filter({ hasText: "the publication's way" });
+  await row.getByText("1 done").waitFor({ timeout: 120_000 });
+  await row.getByRole("link").click();
+  await page.getByRole("heading", { name: "the publication's way" }).waitFor();
+  const batch = (await getJson(server, "/api/batches")).items[0];
+  const [result] = (await getJson(server, `/api/batches/${batch.id}/results`)).items;
+  assert.ok(Object.keys(result.difference).length > 0, "there is a difference to show");
+  for (const figure of ["rows_found", "coverage", "travel_mm", "points"]) {
+    const cell = page.locator(`td[data-figure=${figure}]`);
+    assert.equal(Number(await cell.getAttribute("data-difference")), result.difference[figure]);
+    const [now, change] = [result.after[figure], result.difference[figure]];
+    const sign = change === 0 ? "" : `${change < 0 ? "−" : "+"}${Math.abs(change).toLocaleString("en-US")}`;
+    if (figure === "points") assert.equal((await cell.innerText()).replace(/\s/g, ""), `${now.toLocaleString("en-US")}${sign}`);
+  }
+  await keepPicture(page, "batch-done");
+  await page.getByRole("link", { name: /^Compare with the one before/ }).click();
+  await page.getByRole("heading", { name: "Two measurements side by side" }).waitFor();
+  await close();
+});
+
+test("a batch is paused, goes on, and is cancelled for good", async () => {
+  const waiting = await sendRun(idle, run, { asset: "for the batch" });
+  const { page, close } = await openPage(browser, idle);
+  await page.goto("/queue?again=1&asset=for%20the%20batch");
+  const batches = page.getByRole("region", { name: "Batches" });
+  await batches.getByLabel("Note", { exact: true }).fill("steered");
+  await batches.getByRole("button", { name: "Count the runs" }).click();
+  await batches.getByRole("button", { name: "Measure 1 run again" }).click();
+  const row = batches.getByRole("listitem").filter({ hasText: "steered" });
+  const job = await until("the batch has its job", 20_000, async () => (await getJson(idle, `/api/jobs?run=${waiting.id}`)).items.find(({ batch }) => batch));
+  const stateIs = (state) => until(`its job is ${state}`, 20_000, async () => (await getJson(idle, `/api/jobs/${job.id}`)).state === state);
+  await row.getByRole("button", { name: "Pause" }).click();
+  await row.getByText("Paused", { exact: true }).waitFor({ timeout: 20_000 });
+  await row.getByText("1 held back").waitFor();
+  await stateIs("paused");
+  await row.getByRole("button", { name: "Go on" }).click();
+  await row.getByText("1 waiting").waitFor({ timeout: 20_000 });
+  await stateIs("queued");
+  await row.getByRole("button", { name: "Cancel" }).click();
+  await page.getByRole("dialog").getByRole("button", { name: "Cancel the batch" }).click();
+  await row.getByText("Cancelled", { exact: true }).waitFor({ timeout: 20_000 });
+  await stateIs("cancelled");
+  assert.equal(await row.getByRole("button").count(), 0, "a cancelled batch cannot go on");
   await close();
 });
 

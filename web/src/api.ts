@@ -1,7 +1,9 @@
 // Everything the pages ask of the server. The only file that fetches; shapes come from the OpenAPI document.
 
 import type { components } from "./api.gen.ts";
+import { onWake, patienceMs } from "./awake.ts";
 import type { TilesIndex } from "./map/pyramid.ts";
+import { heardOfSession } from "./session.ts";
 
 type Schemas = components["schemas"];
 export type Run = Schemas["Run"];
@@ -22,6 +24,15 @@ export type LiveStream = Schemas["LiveStream"];
 export type Problem = Schemas["Problem"];
 export type CrossSection = Schemas["CrossSection"];
 export type Trajectory = Schemas["Trajectory"];
+export type Session = Schemas["Session"];
+export type Scope = Schemas["Scope"];
+export type Token = Schemas["Token"];
+export type TokenWithSecret = Schemas["TokenWithSecret"];
+export type RetentionPreview = Schemas["RetentionPreview"];
+export type Batch = Schemas["Batch"];
+export type BatchWish = Schemas["BatchWish"];
+export type BatchResult = Schemas["BatchResult"];
+export type BatchResultPage = Schemas["BatchResultPage"];
 
 /** What we read of a job's `manifest.json`. A file of the product folder, not a shape of the HTTP interface. */
 export interface Manifest {
@@ -69,23 +80,43 @@ export function problemIn(status: number, body: string): Problem {
   return { type: "about:blank", title, status, detail: body.slice(0, 200) || title, retryable: status >= 500 };
 }
 
-async function request(path: string, init?: RequestInit): Promise<Response> {
-  let response: Response;
-  try {
-    response = await fetch(path, init);
-  } catch (error) {
-    if (init?.signal?.aborted) throw error;
-    throw new ApiError(UNREACHABLE);
+/** Requests that only read and wait for their answer: a sleep may have cut them without anybody being told. */
+const reading = new Set<AbortController>();
+onWake(() => reading.forEach((request) => request.abort()));
+
+/** Asks, and reads the answer as the caller wants it. What is cut half-way is no answer. */
+async function ask<T>(path: string, init: RequestInit | undefined, read: (response: Response) => T | Promise<T>): Promise<T> {
+  const stopper = new AbortController();
+  const caller = init?.signal;
+  const stop = () => stopper.abort();
+  caller?.addEventListener("abort", stop);
+  if (caller?.aborted) stop();
+  let patience: ReturnType<typeof setTimeout> | undefined;
+  if (init?.method === undefined) {
+    reading.add(stopper);
+    patience = setTimeout(stop, patienceMs());
   }
-  if (response.ok) return response;
-  // Nobody is logged in, or not any more: the server's own page asks who it is, and comes back here.
-  if (response.status === 401) location.assign(`/login?next=${encodeURIComponent(location.pathname + location.search)}`);
-  throw new ApiError(problemIn(response.status, await response.text().catch(() => "")));
+  try {
+    const response = await fetch(path, { ...init, signal: stopper.signal });
+    clearTimeout(patience);
+    if (response.status === 401) heardOfSession(false);
+    if (response.ok) {
+      heardOfSession(true);
+      return await read(response);
+    }
+    throw new ApiError(problemIn(response.status, await response.text().catch(() => "")));
+  } catch (error) {
+    if (error instanceof ApiError || error instanceof SyntaxError || caller?.aborted) throw error;
+    throw new ApiError(UNREACHABLE);
+  } finally {
+    clearTimeout(patience);
+    reading.delete(stopper);
+    caller?.removeEventListener("abort", stop);
+  }
 }
 
-async function json<T>(path: string, init?: RequestInit): Promise<T> {
-  return (await (await request(path, init)).json()) as T;
-}
+const request = (path: string, init?: RequestInit): Promise<Response> => ask(path, init, (response) => response);
+const json = <T>(path: string, init?: RequestInit): Promise<T> => ask(path, init, async (response) => (await response.json()) as T);
 
 /** A key that nobody else uses. (`crypto.randomUUID` exists only under HTTPS and on localhost.) */
 function newKey(): string {
@@ -119,20 +150,48 @@ export function listRuns(filter: RunFilter, cursor: string | null, limit: number
   return json(`/api/runs?${query}`, signal ? { signal } : undefined);
 }
 
-/** Every asset, by name; more than a page of them is rare. */
-export async function listAssets(): Promise<Asset[]> {
-  const assets: Asset[] = [];
+/** All pages of a list that is not long. */
+async function everyPage<T>(path: string): Promise<T[]> {
+  const items: T[] = [];
   let cursor: string | null | undefined = null;
   do {
-    const page: Schemas["AssetPage"] = await json(`/api/assets?limit=1000${cursor ? `&cursor=${at(cursor)}` : ""}`);
-    assets.push(...page.items);
+    const page: { items: T[]; next_cursor?: string | null } = await json(`${path}?limit=1000${cursor ? `&cursor=${at(cursor)}` : ""}`);
+    items.push(...page.items);
     cursor = page.next_cursor;
   } while (cursor);
-  return assets;
+  return items;
+}
+
+/** Every asset, by name; more than a page of them is rare. */
+export const listAssets = (): Promise<Asset[]> => everyPage("/api/assets");
+
+export const getSession = (): Promise<Session> => json("/api/session");
+export const logOut = (): Promise<Response> => request("/api/session", { method: "DELETE" });
+
+/** Every token, the newest first, without its secret. */
+export const listTokens = (): Promise<Token[]> => everyPage("/api/tokens");
+export const createToken = (wish: Schemas["TokenWish"]): Promise<TokenWithSecret> => json("/api/tokens", creating(wish));
+export const rotateToken = (token: string, overlap_s: number): Promise<TokenWithSecret> => json(`/api/tokens/${at(token)}/rotate`, creating({ overlap_s }));
+export const revokeToken = (token: string): Promise<Token> => json(`/api/tokens/${at(token)}`, { method: "DELETE" });
+
+/** What the server's rules, or others, would delete now. */
+export function previewRetention(rules: { keep_days?: number; quota_gb?: number }): Promise<RetentionPreview> {
+  const query = new URLSearchParams(Object.entries(rules).map(([name, value]) => [name, `${value}`]));
+  return json(`/api/retention?${query}`);
 }
 
 /** The first jobs of a state, the newest first. */
 export const listJobsIn = (state: JobState, limit: number): Promise<JobPage> => json(`/api/jobs?state=${state}&limit=${limit}`);
+
+/** Batches, the newest first. */
+export const listBatches = async (limit: number): Promise<Batch[]> => (await json<Schemas["BatchPage"]>(`/api/batches?limit=${limit}`)).items;
+export const getBatch = (batch: string): Promise<Batch> => json(`/api/batches/${at(batch)}`);
+export const createBatch = (wish: BatchWish): Promise<Batch> => json("/api/batches", creating(wish));
+/** How many runs a batch would take. */
+export const countBatch = async (wish: BatchWish): Promise<number> => (await json<Schemas["BatchPreview"]>("/api/batches", creating({ ...wish, dry_run: true }))).runs;
+export const steerBatch = (batch: string, to: "pause" | "resume" | "cancel"): Promise<Batch> => json(`/api/batches/${at(batch)}/${to}`, creating());
+export const listResults = (batch: string, cursor: string | null): Promise<BatchResultPage> =>
+  json(`/api/batches/${at(batch)}/results?limit=50${cursor === null ? "" : `&cursor=${at(cursor)}`}`);
 export const getJob = (job: string): Promise<Job> => json(`/api/jobs/${at(job)}`);
 export const listWorkers = (): Promise<Worker[]> => json("/api/workers");
 export const listOptions = (): Promise<RecipeOption[]> => json("/api/options");
@@ -140,8 +199,16 @@ export const createRig = (toml: string): Promise<Rig> =>
   json("/api/rigs", { method: "POST", headers: { "idempotency-key": newKey(), "content-type": "application/toml" }, body: toml });
 
 /** What can be changed about a run. */
-export const changeRun = (run: string, change: Schemas["RunChange"]): Promise<Run> =>
-  json(`/api/runs/${at(run)}`, { method: "PATCH", headers: { "content-type": "application/json" }, body: JSON.stringify(change) });
+export type RunChange = Schemas["RunChange"];
+const runPath = (run: string): string => `/api/runs/${at(run)}`;
+
+/** Changes a run where it still is what it was. */
+export const changeRun = ({ id, version }: Run, change: RunChange): Promise<Run> =>
+  json(runPath(id), { method: "PATCH", headers: { "content-type": "application/json", "if-match": `"${version}"` }, body: JSON.stringify(change) });
+
+/** A pinned run is kept whatever the rules say. */
+export const isPinned = async (run: string): Promise<boolean> => (await json<Schemas["Pin"]>(`${runPath(run)}/pin`)).pinned;
+export const setPinned = (run: string, pinned: boolean): Promise<Response> => request(`${runPath(run)}/pin`, { method: pinned ? "PUT" : "DELETE" });
 
 /** Where to cut the wall open, mm in the world; `across`: at one chainage, through the whole map. */
 export interface Cut {
@@ -191,15 +258,15 @@ export interface LiveFrame {
 export async function getLiveFrame(job: string): Promise<{ about: LiveFrame; picture: Blob } | null> {
   const folder = `/api/jobs/${at(job)}/live`;
   try {
-    const picture = await (await request(`${folder}/frame.jpg`, { cache: "no-cache" })).blob();
+    const picture = await ask(`${folder}/frame.jpg`, { cache: "no-cache" }, (response) => response.blob());
     return { about: await json<LiveFrame>(`${folder}/frame.json`, { cache: "no-cache" }), picture };
   } catch (error) {
     if (error instanceof ApiError && error.problem.status === 404) return null;
     throw error;
   }
 }
-export const getRun = (run: string): Promise<Run> => json(`/api/runs/${at(run)}`);
-export const deleteRun = (run: string): Promise<Response> => request(`/api/runs/${at(run)}`, { method: "DELETE" });
+export const getRun = (run: string): Promise<Run> => json(runPath(run));
+export const deleteRun = (run: string): Promise<Response> => request(runPath(run), { method: "DELETE" });
 
 /** A run's jobs, the newest first. */
 export const listJobs = async (run: string): Promise<Job[]> => (await json<JobPage>(`/api/jobs?run=${at(run)}`)).items;
@@ -214,23 +281,14 @@ export const listRigs = async (): Promise<Rig[]> => (await json<Schemas["RigPage
 export const listRecipes = (): Promise<Recipe[]> => json("/api/recipes");
 
 /** A job's whole log. */
-export async function listLog(job: string): Promise<LogLine[]> {
-  const lines: LogLine[] = [];
-  let cursor: string | null | undefined = "";
-  while (cursor !== null && cursor !== undefined) {
-    const page: Schemas["LogPage"] = await json(`/api/jobs/${at(job)}/log?limit=1000${cursor === "" ? "" : `&cursor=${at(cursor)}`}`);
-    lines.push(...page.items);
-    cursor = page.next_cursor;
-  }
-  return lines;
-}
+export const listLog = (job: string): Promise<LogLine[]> => everyPage(`/api/jobs/${at(job)}/log`);
 
 /** A job's products: files at the top of the folder first, tiles after them; one page is enough for the files. */
 export const listProducts = (job: string): Promise<Schemas["ProductPage"]> => json(`/api/jobs/${at(job)}/products`);
 export const getManifest = (job: string): Promise<Manifest> => json(productPath(job, "manifest.json"));
 
 export const getRecording = (job: string): Promise<Recording> => json(`/api/jobs/${at(job)}/recording`);
-export const getBytes = async (path: string): Promise<Uint8Array> => new Uint8Array(await (await request(path)).arrayBuffer());
+export const getBytes = (path: string): Promise<Uint8Array> => ask(path, undefined, async (response) => new Uint8Array(await response.arrayBuffer()));
 
 /** A large file of our own server, telling how many bytes have come, of all where the server says so. */
 export async function getLarge(path: string, progress: (loadedBytes: number, totalBytes: number | null) => void): Promise<Response> {
@@ -271,24 +329,33 @@ export interface JobListener {
 }
 
 const RECONNECT_MS = 3000;
+/** A job that is at work and says nothing for so long may be a dead connection, ms. */
+const SILENT_MS = 60_000;
+const LOOK_MS = 2000;
 
 /** Follows a job's events until the returned function is called; connects again whenever the connection is lost. */
 export function followJob(job: string, listener: JobListener): () => void {
   let source: EventSource;
   let timer: ReturnType<typeof setTimeout> | undefined;
+  let ended = false;
+  let heardAt = Date.now();
   const connect = () => {
+    heardAt = Date.now();
     source = new EventSource(`/api/jobs/${at(job)}/events`);
     source.onopen = () => listener.connected(true);
     source.onerror = () => {
       listener.connected(false);
       // The browser tries again by itself unless the server's answer was not a stream (a proxy's 502, for example).
-      if (source.readyState === EventSource.CLOSED) timer = setTimeout(connect, RECONNECT_MS);
+      if (source.readyState === EventSource.CLOSED && !ended) timer = setTimeout(connect, RECONNECT_MS);
     };
     const on = (name: string, heard: (data: string) => void) =>
-      source.addEventListener(name, (event) => heard((event as MessageEvent<string>).data));
+      source.addEventListener(name, (event) => {
+        heardAt = Date.now();
+        heard((event as MessageEvent<string>).data);
+      });
     const heardJob = (data: string) => {
       const now = JSON.parse(data) as Job;
-      if (!isActive(now)) source.close(); // the server ends the stream here; no need to come back
+      if (!isActive(now)) stop(); // the server ends the stream here; no need to come back
       listener.job(now);
     };
     on("state", heardJob);
@@ -298,18 +365,27 @@ export function followJob(job: string, listener: JobListener): () => void {
   };
   // After a sleep or a cut a connection may look alive for minutes: whoever comes back to the page gets a new one.
   const anew = () => {
-    if (document.hidden) return;
+    if (document.hidden || ended) return;
     clearTimeout(timer);
     source.close();
     connect();
   };
-  connect();
-  addEventListener("online", anew);
-  document.addEventListener("visibilitychange", anew);
-  return () => {
+  const watch = setInterval(() => {
+    const waits = source.readyState === EventSource.CONNECTING ? patienceMs() : SILENT_MS;
+    if (Date.now() - heardAt > waits) anew();
+  }, LOOK_MS);
+  const noWake = onWake(anew);
+  const stop = () => {
+    ended = true;
+    noWake();
     removeEventListener("online", anew);
     document.removeEventListener("visibilitychange", anew);
+    clearInterval(watch);
     clearTimeout(timer);
     source.close();
   };
+  connect();
+  addEventListener("online", anew);
+  document.addEventListener("visibilitychange", anew);
+  return stop;
 }

@@ -2,6 +2,7 @@
 
 import { useEffect, useRef, useState } from "preact/hooks";
 import { followJob, isActive, problemOf, type Job, type Problem } from "./api.ts";
+import { onSession } from "./session.ts";
 import { texts } from "./texts.ts";
 
 /** Names the browser's tab. */
@@ -54,8 +55,11 @@ export function useLoaded<T>(key: string, load: () => Promise<T>, everyMs: (valu
       }
     };
     void attempt();
+    // Whoever has logged in again wants to see what was refused.
+    const noSession = onSession((loggedIn) => loggedIn && setTurn((n) => n + 1));
     return () => {
       stopped = true;
+      noSession();
       clearTimeout(timer);
     };
   }, [key, turn]);

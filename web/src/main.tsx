@@ -4,6 +4,7 @@ import "./style.css";
 import { render } from "preact";
 import { useEffect, useRef } from "preact/hooks";
 import { lazy } from "./lazy.tsx";
+import { LoggedOut } from "./parts/logged_out.tsx";
 import { UploadPill } from "./parts/upload_pill.tsx";
 import { useDroppedFiles } from "./parts/dropped.ts";
 import { go, Link, useRoute, type Route } from "./router.tsx";
@@ -17,11 +18,12 @@ const CompareView = lazy(async () => (await import("./views/compare.tsx")).Compa
 const SendView = lazy(async () => (await import("./views/send.tsx")).SendView);
 const LiveView = lazy(async () => (await import("./views/live.tsx")).LiveView);
 const QueueView = lazy(async () => (await import("./views/queue.tsx")).QueueView);
+const BatchView = lazy(async () => (await import("./views/batch.tsx")).BatchView);
 const SettingsView = lazy(async () => (await import("./views/settings.tsx")).SettingsView);
 
 /** What changes when another view begins: then the reading starts at its top. */
 function addressOf(route: Route): string {
-  return "run" in route ? `${route.view} ${route.run}` : route.view;
+  return "run" in route ? `${route.view} ${route.run}` : "batch" in route ? `${route.view} ${route.batch}` : route.view;
 }
 
 function App() {
@@ -60,7 +62,7 @@ function App() {
             <Link to="/live" current={route.view === "live"}>
               {texts.nav.live}
             </Link>
-            <Link to="/queue" current={route.view === "queue"}>
+            <Link to="/queue" current={route.view === "queue" || route.view === "batch"}>
               {texts.nav.queue}
             </Link>
             <Link to="/settings" current={route.view === "settings"}>
@@ -70,6 +72,7 @@ function App() {
           <UploadPill current={route.view === "send"} />
         </nav>
       </header>
+      <LoggedOut />
       <main id="main" ref={main} tabIndex={-1} class={dragging ? "dragging" : ""}>
         <View route={route} />
       </main>
@@ -92,6 +95,8 @@ function View({ route }: { route: Route }) {
       return <LiveView />;
     case "queue":
       return <QueueView />;
+    case "batch":
+      return <BatchView key={route.batch} batch={route.batch} />;
     case "settings":
       return <SettingsView section={route.section} />;
     case "unknown":

@@ -9,6 +9,7 @@ export type Route =
   | { view: "send" }
   | { view: "live" }
   | { view: "queue" }
+  | { view: "batch"; batch: string }
   | { view: "settings"; section: string }
   | { view: "run"; run: string; job: string | null; tab: string | null }
   | { view: "compare"; run: string; left: string | null; right: string | null }
@@ -33,6 +34,7 @@ export function routeOf(location: { pathname: string; search: string }): Route {
   const unknown: Route = { view: "unknown", path: location.pathname };
   if (second === undefined || more !== undefined) return unknown;
   if (first === "settings" && third === undefined) return { view: "settings", section: second };
+  if (first === "batches" && third === undefined) return { view: "batch", batch: decodeURIComponent(second) };
   if (first !== "runs") return unknown;
   const run = decodeURIComponent(second);
   if (third === undefined) return { view: "run", run, job: query.get("job"), tab: query.get("tab") };
@@ -46,6 +48,9 @@ export function runPath(run: string, job: string | null = null, tab: string | nu
   if (tab !== null) query.set("tab", tab);
   return `/runs/${encodeURIComponent(run)}${query.size === 0 ? "" : `?${query}`}`;
 }
+
+/** The path of a batch's page. */
+export const batchPath = (batch: string): string => `/batches/${encodeURIComponent(batch)}`;
 
 /** Two jobs of a run side by side. */
 export function comparePath(run: string, left: string, right: string): string {

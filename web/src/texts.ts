@@ -36,6 +36,12 @@ export const texts = {
     unreachable: "Stria's server did not answer. Check that it is running and that you are still on its network; this page tries again by itself.",
     uploadCut: "The connection broke before the whole file had arrived. Nothing was kept; send it again.",
   },
+  loggedOut: {
+    heading: "You are not logged in any more",
+    body: "Your session is over, or somebody ended it. What you see stays, but nothing new comes and nothing can be changed.",
+    logIn: "Log in",
+    elsewhere: "Or log in on another tab and come back: this page then goes on by itself, with what you have typed.",
+  },
   progressBar: "Progress of the measurement",
   frames: (frames: string) => `${frames} frames`,
   state: {
@@ -69,6 +75,7 @@ export const texts = {
       "-asset": "Asset Z–A",
     } as Record<string, string>,
     clear: "Clear filters",
+    again: "Measure these again",
     nothing: "No run fits these filters.",
     loadingMore: "Loading more runs…",
     warnings: (warnings: number) => (warnings === 1 ? "1 warning" : `${count(warnings)} warnings`),

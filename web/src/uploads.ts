@@ -6,6 +6,7 @@
 import { useEffect, useState } from "preact/hooks";
 import type { PreviousUpload, Upload as TusUpload } from "tus-js-client";
 import { problemIn, problemOf, UNREACHABLE, type Problem } from "./api.ts";
+import { heardOfSession, onSession } from "./session.ts";
 
 /** What is said about a run when it is sent. */
 export interface UploadFields {
@@ -42,6 +43,8 @@ const RATE_S = 8;
 /** A connection that takes nothing for so long is dead, although nobody has said so; it is looked for so often, ms. */
 const STALLED_MS = 20_000;
 const LOOK_MS = 5000;
+/** Nobody is logged in any more: what arrived stays, and it goes on when somebody is. */
+const UNAUTHORIZED = 401;
 
 interface Entry extends Item {
   file: File | null;
@@ -189,6 +192,10 @@ function make(tus: typeof import("tus-js-client"), entry: Entry, file: File): Tu
     },
     onError: (error) => {
       const response = "originalResponse" in error ? error.originalResponse : null;
+      if (response?.getStatus() === UNAUTHORIZED) {
+        heardOfSession(false);
+        return cut(entry);
+      }
       update(entry, { state: "refused", problem: response ? problemIn(response.getStatus(), response.getBody()) : UNREACHABLE });
       next();
     },
@@ -241,6 +248,7 @@ function forget({ urlStorageKey }: PreviousUpload): void {
 addEventListener("beforeunload", (event) => {
   if (entries.some(({ state }) => state === "sending" || state === "waiting" || state === "cut")) event.preventDefault();
 });
+
 /** Lets go of a connection that is dead; what arrived stays. */
 function cut(entry: Entry): void {
   void entry.tus?.abort();
@@ -253,6 +261,7 @@ function goOn(): void {
   next();
 }
 
+onSession((loggedIn) => loggedIn && goOn());
 addEventListener("offline", () => entries.filter(({ state }) => state === "sending").forEach(cut));
 addEventListener("online", () => {
   entries.filter(({ state }) => state === "sending").forEach(cut);

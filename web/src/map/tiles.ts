@@ -1,5 +1,6 @@
 // The tiles that are loaded: a bounded number, the ones in view first.
 
+import { onWake, patienceMs } from "../awake.ts";
 import { keyOf, type TileAddress, type TilesIndex } from "./pyramid.ts";
 import type { Style } from "./colours.ts";
 import type { Delivery, Order } from "./tile_worker.ts";
@@ -33,6 +34,8 @@ const MOST_TILES = 180;
 /** Requests at the same time: as many as a browser has connections to one host, less one for everything else. */
 const MOST_REQUESTS = 5;
 const RETRY_MS = 3000;
+/** A whole tile may take so many times what the beginning of an answer may. */
+const WHOLE_TILE = 3;
 
 export class TileStore {
   private readonly worker = new Worker(new URL("./tile_worker.ts", import.meta.url), { type: "module" });
@@ -45,6 +48,7 @@ export class TileStore {
   private fetching = 0;
   private wishes: { address: TileAddress; texture: boolean }[] = [];
   private readonly waiting = new Map<string, ((tile: Tile | null) => void)[]>();
+  private readonly noWake: () => void;
 
   constructor(
     private readonly folder: string,
@@ -54,9 +58,12 @@ export class TileStore {
   ) {
     this.style = style;
     this.worker.onmessage = (event: MessageEvent<Delivery>) => this.receive(event.data);
+    // What was on its way when the machine fell asleep never comes: it is asked for again.
+    this.noWake = onWake(() => [...this.orders].forEach(([id, { kind }]) => kind !== "paint" && this.send({ is: "stop", id })));
   }
 
   close(): void {
+    this.noWake();
     this.worker.terminate();
     for (const entry of this.entries.values()) drop(entry);
     this.entries.clear();
@@ -178,6 +185,7 @@ export class TileStore {
     const id = this.order(entry, kind);
     const fresh = !this.index.complete;
     this.fetching += 1;
+    setTimeout(() => this.orders.has(id) && this.send({ is: "stop", id }), WHOLE_TILE * patienceMs());
     const name = kind === "depth" ? `depth/${level}/${column}_${row}.png` : `texture/${level}/${column}_${row}.jpg`;
     const url = `${this.folder}/${name}`;
     if (kind === "texture") this.send({ is: "texture", id, url, fresh, depth_mm: entry.depth_mm });

@@ -5,9 +5,9 @@ import { useState } from "preact/hooks";
 import { problemOf, type Problem } from "../api.ts";
 import { ProblemBox } from "./problem.tsx";
 
-type Props = { class?: string; disabled?: boolean; action: () => Promise<unknown>; children: ComponentChildren };
+type Props = { class?: string; disabled?: boolean; label?: string; action: () => Promise<unknown>; children: ComponentChildren };
 
-export function ActionButton({ action, disabled, children, ...rest }: Props) {
+export function ActionButton({ action, disabled, label, children, ...rest }: Props) {
   const [waiting, setWaiting] = useState(false);
   const [problem, setProblem] = useState<Problem | null>(null);
   const press = async () => {
@@ -22,7 +22,7 @@ export function ActionButton({ action, disabled, children, ...rest }: Props) {
   };
   return (
     <>
-      <button type="button" disabled={waiting || disabled} onClick={() => void press()} {...rest}>
+      <button type="button" aria-label={label} disabled={waiting || disabled} onClick={() => void press()} {...rest}>
         {children}
       </button>
       {problem && <ProblemBox problem={problem} onDismiss={() => setProblem(null)} />}

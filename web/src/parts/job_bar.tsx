@@ -6,7 +6,7 @@ import { texts } from "../texts.ts";
 
 /** True where it can be told how far a job is: not while its source is still growing. */
 function endKnown(job: Job): boolean {
-  return job.frames_total != null || job.progress > 0;
+  return (job.frames_total ?? 0) > 0 || job.progress > 0;
 }
 
 export function JobBar({ job }: { job: Job }) {

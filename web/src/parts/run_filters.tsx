@@ -1,6 +1,7 @@
 // What to look for among the runs.
 
 import type { Asset, RunFilter } from "../api.ts";
+import { Link } from "../router.tsx";
 import { texts } from "../texts.ts";
 
 const words = texts.runs;
@@ -50,6 +51,7 @@ export function RunFilters({ filter, assets, onChange }: Props) {
           {words.clear}
         </button>
       )}
+      {used && <Link to={`/queue?${new URLSearchParams({ again: "1", ...filter, sort: "" })}`}>{words.again}</Link>}
     </form>
   );
 }

@@ -16,11 +16,12 @@ export const workTexts = {
     heading: "Queue",
     running: "At work",
     waiting: "Waiting",
-    ended: "Ended lately",
     workers: "Workers",
-    none: { running: "No job is at work.", queued: "Nothing waits.", failed: "No job failed.", workers: "No worker is there: jobs wait until one comes. Start one with `stria work`, or a server with `--workers`." },
+    none: { running: "No job is at work.", queued: "Nothing waits.", failed: "No job failed.", cancelled: "Nobody cancelled a job.", workers: "No worker is there: jobs wait until one comes. Start one with `stria work`, or a server with `--workers`." },
     failed: "Failed",
     cancelled: "Cancelled",
+    gaveUp: (attempts: number) => (attempts === 1 ? "Given up after 1 attempt," : `Given up after ${count(attempts)} attempts,`),
+    moreFailed: "Show more",
     why: {
       turn: "Waits for a free worker.",
       workers: "No worker is there.",
@@ -42,7 +43,7 @@ export const workTexts = {
   },
   settings: {
     heading: "Settings",
-    sections: { rigs: "Rigs", recipes: "Recipes" } as Record<string, string>,
+    sections: { rigs: "Rigs", recipes: "Recipes", tokens: "Tokens", retention: "Keeping" } as Record<string, string>,
     sectionsLabel: "Settings",
     rigs: {
       about: "A rig is one camera and one laser, fixed to each other. Every run names the one that recorded it.",

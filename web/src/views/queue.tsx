@@ -1,9 +1,11 @@
-// The queue: what is at work, what waits and why, what ended badly, who works.
+// The queue: what is at work, what waits and why, batches, who works, what ended badly and can be tried again.
 
+import { useState } from "preact/hooks";
 import { cancelJob, getRun, listJobsIn, listWorkers, retryJob, type Job, type Run, type Worker } from "../api.ts";
 import { count, duration, secondsBetween } from "../format.ts";
 import { useLoaded, useTitle } from "../hooks.ts";
 import { ActionButton } from "../parts/action_button.tsx";
+import { Batches } from "../parts/batches.tsx";
 import { farInWords, JobBar } from "../parts/job_bar.tsx";
 import { ProblemBox } from "../parts/problem.tsx";
 import { State } from "../parts/state.tsx";
@@ -16,7 +18,9 @@ import { workTexts } from "../texts/work.ts";
 const words = workTexts.queue;
 const FRESH_MS = 3000;
 const MOST = 100;
-const ENDED = 20;
+/** Failed jobs that are shown at first, and how many more at a time. */
+const FAILED = 20;
+const CANCELLED = 10;
 
 const runs = new Map<string, Promise<Run | null>>();
 
@@ -32,20 +36,28 @@ interface Entry {
   run: Run | null;
 }
 
-async function loadQueue() {
-  const [running, queued, failed, cancelled, workers] = await Promise.all([listJobsIn("running", MOST), listJobsIn("queued", MOST), listJobsIn("failed", ENDED), listJobsIn("cancelled", ENDED), listWorkers()]);
+async function loadQueue(mostFailed: number) {
+  const [running, queued, failed, cancelled, workers] = await Promise.all([listJobsIn("running", MOST), listJobsIn("queued", MOST), listJobsIn("failed", mostFailed), listJobsIn("cancelled", CANCELLED), listWorkers()]);
   const named = (jobs: Job[]): Promise<Entry[]> => Promise.all(jobs.map(async (job) => ({ job, run: await runOf(job) })));
   // The queue's own order is its ranks'; the oldest of the most urgent comes next.
   const urgency = { live: 0, upload: 1, batch: 2 };
   const waiting = queued.items.sort((a, b) => urgency[a.priority] - urgency[b.priority] || a.created_at.localeCompare(b.created_at));
-  const ended = [...failed.items, ...cancelled.items].sort((a, b) => (b.finished_at ?? "").localeCompare(a.finished_at ?? "")).slice(0, ENDED);
   // A server without workers of its own is listed with no places: it takes no job.
   const taking = workers.filter(({ slots }) => slots > 0);
-  return { running: await named(running.items), waiting: await named(waiting), more: queued.next_cursor != null, ended: await named(ended), workers: taking };
+  return {
+    running: await named(running.items),
+    waiting: await named(waiting),
+    more: queued.next_cursor != null,
+    failed: await named(failed.items),
+    moreFailed: failed.next_cursor != null,
+    cancelled: await named(cancelled.items),
+    workers: taking,
+  };
 }
 
 export function QueueView() {
-  const queue = useLoaded("queue", loadQueue, () => FRESH_MS);
+  const [mostFailed, setMostFailed] = useState(FAILED);
+  const queue = useLoaded("queue", () => loadQueue(mostFailed), () => FRESH_MS);
   useTitle(words.heading);
   const value = queue.value;
   return (
@@ -59,8 +71,18 @@ export function QueueView() {
           <Group heading={words.waiting} none={words.none.queued} entries={value.waiting} onChanged={queue.reload} tell={(job) => <Waits job={job} workers={value.workers} />}>
             {value.more && <p class="faint">{words.more}</p>}
           </Group>
-          <Workers workers={value.workers} />
-          <Group heading={words.ended} none={words.none.failed} entries={value.ended} onChanged={queue.reload} tell={(job) => <span class="faint clamp">{job.error?.detail ?? ""}</span>} />
+          <Batches />
+          <Workers workers={value.workers} running={value.running} />
+          <Group heading={words.failed} none={words.none.failed} entries={value.failed} onChanged={queue.reload} tell={(job) => <WentWrong job={job} />}>
+            {value.moreFailed && (
+              <p class="actions">
+                <button type="button" onClick={() => (setMostFailed(mostFailed + MOST), queue.reload())}>
+                  {words.moreFailed}
+                </button>
+              </p>
+            )}
+          </Group>
+          <Group heading={words.cancelled} none={words.none.cancelled} entries={value.cancelled} onChanged={queue.reload} tell={(job) => <Ended job={job} />} />
         </>
       )}
     </>
@@ -136,7 +158,23 @@ function Waits({ job, workers }: { job: Job; workers: Worker[] }) {
   );
 }
 
-function Workers({ workers }: { workers: Worker[] }) {
+function Ended({ job }: { job: Job }) {
+  return <span class="faint">{job.finished_at && <Time at={job.finished_at} />}</span>;
+}
+
+/** Why a job was given up, and after how many attempts. */
+function WentWrong({ job }: { job: Job }) {
+  return (
+    <>
+      <span class="clamp">{job.error?.detail ?? ""}</span>
+      <span class="faint">
+        {words.gaveUp(job.attempt)} <Ended job={job} />
+      </span>
+    </>
+  );
+}
+
+function Workers({ workers, running }: { workers: Worker[]; running: Entry[] }) {
   return (
     <section class="card" aria-label={words.workers}>
       <h2>{words.workers}</h2>
@@ -152,7 +190,16 @@ function Workers({ workers }: { workers: Worker[] }) {
                   {words.up} <Time at={worker.started_at} />, {words.seen} <Time at={worker.seen_at} />
                 </span>
               </span>
-              <span class="queue-tell faint">{words.slots(worker.jobs.length, worker.slots)}</span>
+              <span class="queue-tell faint">
+                {words.slots(worker.jobs.length, worker.slots)}
+                {running
+                  .filter(({ job }) => worker.jobs.includes(job.id))
+                  .map(({ job, run }) => (
+                    <Link key={job.id} to={runPath(job.run, run !== null && run.job.id !== job.id ? job.id : null)}>
+                      {run === null ? words.run : `${run.asset}, ${run.source.filename}`}
+                    </Link>
+                  ))}
+              </span>
             </li>
           ))}
         </ul>

@@ -7,6 +7,7 @@ import { lengthMm, percent } from "../format.ts";
 import { once, useFollowed, useLoaded, useTitle, type Followed } from "../hooks.ts";
 import { lazy } from "../lazy.tsx";
 import { ConfirmButton } from "../parts/confirm_button.tsx";
+import { EditRun, PinRun } from "../parts/edit_run.tsx";
 import { JobLog } from "../parts/job_log.tsx";
 import { JobProgress } from "../parts/job_progress.tsx";
 import { ProblemBox } from "../parts/problem.tsx";
@@ -85,7 +86,9 @@ export function RunView({ run: id, job: chosen, tab: wanted }: { run: string; jo
       <section id="part" class="card part" role="tabpanel" aria-label={runTexts.tabs[tab]} key={`${job.id} ${tab}`}>
         <Part tab={tab} run={run} job={job} jobs={jobs.map((other) => (other.id === job.id ? job : other))} live={live} onChanged={loaded.reload} />
       </section>
-      <section class="danger">
+      <section class="danger actions">
+        <EditRun run={run.id} onChanged={loaded.reload} />
+        <PinRun run={run.id} />
         <ConfirmButton
           label={runTexts.run.delete}
           heading={runTexts.run.deleteHeading(run.source.filename)}

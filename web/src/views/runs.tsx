@@ -5,12 +5,14 @@ import { getRun, isActive, listAssets, listRuns, problemOf, productPath, type Pr
 import { lengthMm, size } from "../format.ts";
 import { once, useLoaded, useTitle } from "../hooks.ts";
 import { CommandLine } from "../parts/command_line.tsx";
+import { dayStart } from "../parts/days.ts";
 import { farInWords, JobBar } from "../parts/job_bar.tsx";
 import { ProblemBox } from "../parts/problem.tsx";
 import { RunFilters } from "../parts/run_filters.tsx";
 import { State } from "../parts/state.tsx";
 import { Time } from "../parts/time.tsx";
 import { Link, readQuery, runPath, writeQuery } from "../router.tsx";
+import { onSession } from "../session.ts";
 import { EXAMPLE_COMMAND, texts } from "../texts.ts";
 import { VirtualList } from "../virtual_list.tsx";
 
@@ -86,13 +88,7 @@ function same(a: RunFilter, b: RunFilter): boolean {
 
 /** Dates as the form has them, as times that the server compares: from the day's start, until the day's end, both local. */
 function asked(filter: RunFilter): RunFilter {
-  const day = (text: string, later: number) => {
-    const start = new Date(`${text}T00:00:00`);
-    if (text === "" || Number.isNaN(start.getTime())) return "";
-    start.setDate(start.getDate() + later);
-    return start.toISOString();
-  };
-  return { ...filter, from: day(filter.from, 0), to: day(filter.to, 1) };
+  return { ...filter, from: dayStart(filter.from, 0), to: dayStart(filter.to, 1) };
 }
 
 interface Runs {
@@ -142,7 +138,9 @@ function useRuns(filter: RunFilter): Runs {
     // The first list at once; then typing is waited for.
     if (now.current.items === null) void begin();
     else wait(TYPING_MS, begin);
+    const noSession = onSession((loggedIn) => loggedIn && setTurn((n) => n + 1));
     return () => {
+      noSession();
       stopper.abort();
       clearTimeout(timer);
     };
