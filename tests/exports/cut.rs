@@ -7,11 +7,14 @@ use std::time::{Duration, Instant, SystemTime};
 use stria_core::export::manifest::{FILE_NAME, Manifest, sha256_of_file};
 use stria_core::mcap_file;
 use stria_tests::support::readers::{python_program, run};
-use stria_tests::support::{files_below, long_run, run_stria, stria};
+use stria_tests::support::{files_below, long_run, run_stria, short_run, stria};
 
 use super::{said, text, write_cloud};
 
-const FORMATS: [&str; 3] = ["laz", "pcd", "e57"];
+const FORMATS: [&str; 4] = ["ply", "laz", "pcd", "e57"];
+/// What is made of a whole job's products, with the options that let it be made anew instead of copied.
+const OF_A_JOB: [(&str, &[&str]); 5] =
+    [("mcap", &["--every", "2"]), ("glb", &[]), ("csv", &["--at-mm", "100"]), ("tiff", &[]), ("rrd", &[])];
 
 /// What is there under its final name: the old file or the whole new one, never anything else.
 fn check(out: &Path, old: &str, new: &str, when: &str) -> bool {
@@ -20,32 +23,48 @@ fn check(out: &Path, old: &str, new: &str, when: &str) -> bool {
     found == new
 }
 
+/// Exports with the file's size limited to so many shares of the whole: the old file must stay.
+fn cut_at_bytes(products: &Path, folder: &Path, format: &str, more: &[&str], cuts: u64) {
+    let whole = folder.join(format!("whole.{format}"));
+    let command = ["export", text(products), "--format", format, "--out"];
+    let done = run_stria(&[&command[..], &[text(&whole)], more].concat());
+    assert!(done.status.success(), "{}", said(&done));
+    let new = sha256_of_file(&whole).expect("hashed");
+    let kilobytes = whole.metadata().expect("a file").len() / 1024;
+    assert!(kilobytes > 0, "{format}: too small to be cut");
+    let out = folder.join(format!("out.{format}"));
+    for step in 0..cuts {
+        // The shell's unit is a kilobyte; the signal at the limit kills like kill -9 does.
+        let limit = (kilobytes * step / (cuts - 1)).min(kilobytes - 1);
+        std::fs::write(&out, "old").expect("write");
+        let old = sha256_of_file(&out).expect("hashed");
+        let script = format!("ulimit -c 0 -f {limit}; exec \"$@\"");
+        let done = Command::new("bash")
+            .args(["-c", &script, "bash"])
+            .arg(stria())
+            .args(command)
+            .arg(&out)
+            .args(more)
+            .output()
+            .expect("bash starts");
+        assert!(!done.status.success(), "{format}: {limit} of {kilobytes} kB were enough");
+        assert!(!check(&out, &old, &new, &format!("after {limit} kB")), "{format}");
+    }
+}
+
 #[test]
 fn an_export_cut_at_any_byte_leaves_the_old_file_or_the_whole_new_one() {
     let folder = tempfile::tempdir().expect("a folder");
     write_cloud(folder.path(), 60_000);
     for format in FORMATS {
-        let whole = folder.path().join(format!("whole.{format}"));
-        let done = run_stria(&["export", text(folder.path()), "--format", format, "--out", text(&whole)]);
-        assert!(done.status.success(), "{}", said(&done));
-        let new = sha256_of_file(&whole).expect("hashed");
-        let kilobytes = whole.metadata().expect("a file").len() / 1024;
-        let out = folder.path().join(format!("out.{format}"));
-        for step in 0..12 {
-            // The shell's unit is a kilobyte; the signal at the limit kills like kill -9 does.
-            let limit = (kilobytes * step / 11).min(kilobytes - 1);
-            std::fs::write(&out, "old").expect("write");
-            let old = sha256_of_file(&out).expect("hashed");
-            let script = format!("ulimit -c 0 -f {limit}; exec \"$@\"");
-            let done = Command::new("bash")
-                .args(["-c", &script, "bash"])
-                .arg(stria())
-                .args(["export", text(folder.path()), "--format", format, "--out", text(&out)])
-                .output()
-                .expect("bash starts");
-            assert!(!done.status.success(), "{format}: {limit} of {kilobytes} kB were enough");
-            assert!(!check(&out, &old, &new, &format!("after {limit} kB")), "{format}");
-        }
+        cut_at_bytes(folder.path(), folder.path(), format, &[], 12);
+    }
+    let products = folder.path().join("job");
+    let run = short_run();
+    let done = run_stria(&["process", text(&run.video), "--rig", text(&run.rig), "--out", text(&products)]);
+    assert!(matches!(done.status.code(), Some(0 | 3)), "{}", said(&done));
+    for (format, more) in OF_A_JOB {
+        cut_at_bytes(&products, folder.path(), format, more, 6);
     }
 }
 
