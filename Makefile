@@ -1,5 +1,5 @@
 # Everything a person does with Stria's sources. `make demo` and `make test` need only Debian 12, Rust, Node and make.
-.PHONY: demo test bench bench-live check setup web build
+.PHONY: demo test bench bench-live bench-upload check setup web build
 
 # Sets up, builds, makes a realistic run, processes it through the server and says which URL to open.
 demo: build
@@ -18,6 +18,11 @@ bench: build
 LIVE ?= 1
 bench-live: build
 	target/python/bin/python tests/bench/live.py $(LIVE)
+
+# An upload on loopback beside a plain copy of the same file; MB=4000 sends that much.
+MB ?= 1000
+bench-upload: build
+	target/python/bin/python tests/bench/upload.py $(MB)
 
 # Format, lints and docs as errors.
 check: setup web

@@ -257,10 +257,10 @@ impl<'a> Products<'a> {
         Ok(())
     }
 
-    /// Hands tiles out while the run goes on, now and then, so that people can look. Answers what changed.
+    /// Hands tiles out while the run goes on, now and then, where people can look. Answers what changed.
     fn write_changed_tiles(&mut self) -> Result<Vec<String>> {
         let (Some(map), Some(tiles)) = (&mut self.map, &mut self.tiles) else { return Ok(Vec::new()) };
-        if !self.frames.is_multiple_of(u64::from(self.request.recipe.map.tile_frames)) {
+        if !self.request.live_segments || !self.frames.is_multiple_of(u64::from(self.request.recipe.map.tile_frames)) {
             return Ok(Vec::new());
         }
         for index in map.take_changed() {
