@@ -1,5 +1,5 @@
 # Everything a person does with Stria's sources. `make demo` and `make test` need only Debian 12, Rust, Node and make.
-.PHONY: demo test bench bench-live bench-upload check setup web build
+.PHONY: demo test bench bench-exports bench-live bench-upload check setup web build
 
 # Sets up, builds, makes a realistic run, processes it through the server and says which URL to open.
 demo: build
@@ -13,6 +13,10 @@ test: build
 # Speed, memory and accuracy on this machine in one run, over simulated full HD runs; BENCH="--help" explains the rest.
 bench: build
 	target/python/bin/python tests/bench/bench.py $(BENCH)
+
+# What the cloud of 30 minutes costs to hand on: size, time and memory of each export; and the size of archives.
+bench-exports: build
+	target/python/bin/python tests/bench/bench.py --skip speed,memory,accuracy $(BENCH)
 
 # A live run: frames lost, latency, the server's memory; LIVE=10 streams for ten minutes.
 LIVE ?= 1

@@ -3,13 +3,13 @@
 import assert from "node:assert/strict";
 import { execFile } from "node:child_process";
 import { existsSync } from "node:fs";
-import { readFile, writeFile } from "node:fs/promises";
+import { readFile } from "node:fs/promises";
 import path from "node:path";
 import { after, before, test } from "node:test";
 import { setTimeout as sleep } from "node:timers/promises";
 import { fileURLToPath } from "node:url";
 import { promisify } from "node:util";
-import { getJson, jobEnds, keepPicture, openPage, sendRun, simulate, startBrowser, startServer, until, walk } from "./support.mjs";
+import { fetchProduct, getJson, jobEnds, keepPicture, openPage, sendRun, simulate, startBrowser, startServer, until, walk } from "./support.mjs";
 
 const rerun = path.resolve(path.dirname(fileURLToPath(import.meta.url)), "../../target/python/bin/rerun");
 const DONE_MS = 120_000;
@@ -18,10 +18,13 @@ const SHOWN_MS = 60_000;
 /** Share of the 3D view's pixels that the surface must colour, and how many times more than stand there without it. */
 const SURFACE_SHARE = 0.02;
 const SURFACE_TIMES = 5;
+/** Share of the viewer's canvas that the pictures in an archive must make. */
+const PICTURES_SHARE = 0.1;
 
 let server, browser;
 
 before(async () => {
+  assert.ok(existsSync(rerun), `${rerun} is missing: run \`make setup\``);
   [server, browser] = await Promise.all([startServer(["--live-come-back-s", "2"]), startBrowser()]);
 });
 after(async () => {
@@ -42,22 +45,36 @@ test("a finished run: the surface is on the canvas, and its pixels are the surfa
   const withSurface = await settledShare(page);
   await keepPicture(page.locator(".view").first(), "view3d");
 
+  const show = async (recording) => {
+    await page.route("**/recording/*", (route) => route.fulfill({ body: recording, contentType: "application/octet-stream" }));
+    await page.route("**/recording", (route) =>
+      route.fulfill({ json: { segments: [{ number: 0, generation: 1, bytes: recording.length, url: "/recording/0" }], complete: true, recording: null } }),
+    );
+    await page.goto(address);
+    await page.getByRole("button", { name: "Open 3D view" }).click();
+    await page.getByText("The whole recording is shown").waitFor({ timeout: SHOWN_MS });
+    return settledShare(page);
+  };
   // The same recording without the surface's points must look different just there.
   const { items } = await getJson(server, `/api/runs?limit=1`);
-  const bare = await withoutSurface(items[0].job.id, run.folder);
-  await page.route("**/recording/*", (route) => route.fulfill({ body: bare, contentType: "application/octet-stream" }));
-  await page.route("**/recording", (route) =>
-    route.fulfill({ json: { segments: [{ number: 0, generation: 1, bytes: bare.length, url: "/recording/0" }], complete: true, recording: null } }),
-  );
-  await page.goto(address);
-  await page.getByRole("button", { name: "Open 3D view" }).click();
-  await page.getByText("The whole recording is shown").waitFor({ timeout: SHOWN_MS });
-  const bareShare = await settledShare(page);
+  const whole = await fetchProduct(server, items[0].job.id, "recording.rrd", run.folder);
+  const bareShare = await show(await without(["/world/surface"], whole));
   await keepPicture(page.locator(".view").first(), "view3d-without-surface");
 
   const shares = `coloured share of the 3D view: ${withSurface.toFixed(4)} with the surface, ${bareShare.toFixed(4)} without`;
   assert.ok(withSurface > SURFACE_SHARE, shares);
   assert.ok(withSurface > SURFACE_TIMES * bareShare, shares);
+
+  // The archive, made a recording by rerun's own tool, is shown by the same viewer: the camera's video and the depth map.
+  const archive = await fetchProduct(server, items[0].job.id, "archive.mcap", run.folder);
+  const converted = path.join(run.folder, "converted.rrd");
+  await promisify(execFile)(rerun, ["mcap", "convert", archive, "-o", converted]);
+  await show(await readFile(converted));
+  const shown = await keepPicture(page.locator(".view").first(), "view3d-archive");
+  await show(await without(["/camera/video", "/depth_map/image"], converted));
+  const bare = await keepPicture(page.locator(".view").first(), "view3d-archive-without-pictures");
+  const share = await differenceOf(page, shown, bare);
+  assert.ok(share > PICTURES_SHARE, `share of the view that the archive's pictures make: ${share}`);
   await run.remove();
   await close();
 });
@@ -108,14 +125,27 @@ async function send(page, run) {
   return sent;
 }
 
-/** The job's recording with the surface's points taken out, by rerun's own tool. */
-async function withoutSurface(job, folder) {
-  assert.ok(existsSync(rerun), `${rerun} is missing: run \`make setup\``);
-  const response = await fetch(new URL(`/api/jobs/${job}/products/recording.rrd`, server.url));
-  const [whole, bare] = [path.join(folder, "whole.rrd"), path.join(folder, "bare.rrd")];
-  await writeFile(whole, Buffer.from(await response.arrayBuffer()));
-  await promisify(execFile)(rerun, ["rrd", "filter", "--drop-entity", "/world/surface", "-o", bare, whole]);
+/** A recording with some of its entities taken out, by rerun's own tool. */
+async function without(entities, recording) {
+  const bare = `${recording}.bare.rrd`;
+  await promisify(execFile)(rerun, ["rrd", "filter", ...entities.flatMap((entity) => ["--drop-entity", entity]), "-o", bare, recording]);
   return readFile(bare);
+}
+
+/** Share of the pixels that differ clearly between two pictures of the same size. */
+async function differenceOf(page, ...pictures) {
+  return page.evaluate(async (base64) => {
+    const read = async (text) => {
+      const image = await createImageBitmap(new Blob([Uint8Array.from(atob(text), (c) => c.charCodeAt(0))], { type: "image/png" }));
+      const context = new OffscreenCanvas(image.width, image.height).getContext("2d");
+      context.drawImage(image, 0, 0);
+      return context.getImageData(0, 0, image.width, image.height).data;
+    };
+    const [one, other] = await Promise.all(base64.map(read));
+    let different = 0;
+    for (let at = 0; at < one.length; at += 4) different += Number(Math.max(...[0, 1, 2].map((of) => Math.abs(one[at + of] - other[at + of]))) > 50);
+    return different / (one.length / 4);
+  }, pictures.map((picture) => picture.toString("base64")));
 }
 
 /** The coloured share once it has stopped changing. */
