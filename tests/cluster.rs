@@ -5,4 +5,5 @@ mod cluster {
     mod copies;
     mod engines;
     mod many;
+    mod streams;
 }

@@ -4,11 +4,14 @@ mod service {
     mod api;
     mod batches;
     mod commands;
+    mod confined;
     mod crashes;
     mod doors;
     mod jobs;
     mod keeping;
     mod measure;
+    mod openapi;
     mod refusals;
+    mod slow;
     mod uploads;
 }

@@ -119,11 +119,16 @@ pub struct RequestLimits {
     pub stop_grace: Duration,
 }
 
+impl RequestLimits {
+    /// Largest body of what is no upload, bytes.
+    pub const SMALL_BODY_BYTES: usize = 256 * 1024;
+}
+
 impl Default for RequestLimits {
     fn default() -> Self {
         RequestLimits {
             upload_bytes: 64 * GB,
-            small_body_bytes: 256 * 1024,
+            small_body_bytes: RequestLimits::SMALL_BODY_BYTES,
             form_fields: 32,
             uploads_at_once: 16,
             disk_reserve_bytes: 2 * GB,

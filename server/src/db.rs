@@ -94,6 +94,12 @@ impl WriteTransaction {
 }
 
 impl Db {
+    /// The records answer.
+    pub async fn ping(&self) -> Result<()> {
+        self.connection.execute_unprepared("SELECT 1").await?;
+        Ok(())
+    }
+
     /// Opens the records and brings them to this version's schema.
     pub async fn open(place: &DatabasePlace) -> Result<Db> {
         match place {

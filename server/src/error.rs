@@ -45,7 +45,7 @@ pub enum Error {
     #[error("the idempotency key '{0}' was already used with other content")]
     KeyReused(String),
     /// More bytes than the server takes.
-    #[error("the upload is larger than this server's limit of {limit_bytes} bytes")]
+    #[error("the request is larger than this server's limit of {limit_bytes} bytes")]
     TooLarge {
         /// The limit.
         limit_bytes: u64,

@@ -5,6 +5,7 @@
 mod archive;
 mod batches;
 pub mod connection;
+mod docs;
 mod document;
 mod doors;
 mod events;
@@ -31,10 +32,12 @@ mod squeeze;
 mod stored;
 mod tokens;
 mod uploads;
+mod worker;
 
 use std::sync::Arc;
 
 pub use doors::Rates;
+pub use worker::{WorkerApp, worker_router};
 
 use axum::http::Uri;
 use axum::response::Json;
@@ -85,6 +88,8 @@ pub struct App {
     pub disk: DiskGuard,
     /// One permit per upload that may come in at the same time.
     pub arrivals: Arc<Semaphore>,
+    /// What this machine does not allow, in words for people.
+    pub warnings: Arc<Vec<String>>,
     /// The server shall stop: streams end.
     pub stop: CancellationToken,
 }
@@ -179,6 +184,7 @@ pub fn router(app: App) -> Router {
     let (api, _) = routes().split_for_parts();
     let limits = app.config.requests.clone();
     api.route("/api/openapi.json", get(move || async move { Json(document.as_ref().clone()) }))
+        .route("/api/docs", get(docs::get_docs))
         .route("/api", axum::routing::any(unknown))
         .route("/api/", axum::routing::any(unknown))
         .route("/api/{*rest}", axum::routing::any(unknown))

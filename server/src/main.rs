@@ -8,6 +8,7 @@ pub mod backup;
 pub mod batches;
 pub mod cli;
 pub mod config;
+pub mod confinement;
 pub mod db;
 pub mod disk;
 pub mod error;

@@ -45,6 +45,13 @@ struct Waiting {
     state: &'static str,
 }
 
+/// What a child is kept from.
+#[derive(Clone, Debug, Hash, PartialEq, Eq, EncodeLabelSet)]
+pub struct Fence {
+    /// `network` or `files`.
+    pub what: String,
+}
+
 /// Seconds between which things are counted: from a tenth to a day.
 const SECONDS: [f64; 10] = [0.1, 0.5, 1.0, 5.0, 15.0, 60.0, 300.0, 1800.0, 7200.0, 86_400.0];
 
@@ -69,6 +76,8 @@ pub struct Metrics {
     pub wait_s: Histogram,
     /// Leases that this process took from a silent worker.
     pub leases_lost: Counter,
+    /// 1 where the processes that decode videos are kept from it, 0 where this system does not allow that.
+    pub fences: Family<Fence, Gauge>,
     queue_jobs: Family<Waiting, Gauge>,
     queue_oldest_s: Family<Waiting, Gauge<f64, std::sync::atomic::AtomicU64>>,
     disk_free_bytes: Gauge,
@@ -94,6 +103,7 @@ impl Metrics {
             stage_s: Family::new_with_constructor(|| Histogram::new(SECONDS)),
             wait_s: Histogram::new(SECONDS),
             leases_lost: Counter::default(),
+            fences: Family::default(),
             queue_jobs: Family::default(),
             queue_oldest_s: Family::default(),
             disk_free_bytes: Gauge::default(),
@@ -109,6 +119,7 @@ impl Metrics {
         r.register("stage_seconds", "Time of finished jobs by stage", m.stage_s.clone());
         r.register("wait_seconds", "Time between enqueue and claim", m.wait_s.clone());
         r.register("leases_lost", "Leases taken from silent workers", m.leases_lost.clone());
+        r.register("fences", "1 where children are kept from it, 0 where the system cannot", m.fences.clone());
         r.register("queue_jobs", "Jobs that wait or run", m.queue_jobs.clone());
         r.register("queue_oldest_seconds", "Age of the oldest job that waits or runs", m.queue_oldest_s.clone());
         r.register("disk_free_bytes", "Room on the disk of this process's folder", m.disk_free_bytes.clone());

@@ -10,7 +10,7 @@ use sea_orm::{ActiveValue::Set, ColumnTrait, ConnectionTrait, EntityTrait, Query
 
 use serde::{Deserialize, Serialize};
 
-pub use jobs::{StoredFile, content_type};
+pub use jobs::{CONTENT_TYPES, StoredFile, content_type};
 pub use listing::{Page, RunFilter, RunSort};
 pub use rigs::{RecipeText, RigText, built_in_recipes, options};
 
@@ -143,7 +143,7 @@ impl Runs {
 
     /// The records answer.
     pub async fn ping(&self) -> Result<()> {
-        Ok(self.db.read().execute_unprepared("SELECT 1").await.map(|_| ())?)
+        self.db.ping().await
     }
 
     /// A whole upload becomes a run with one job. The file goes into the store first, under a key that is marked for

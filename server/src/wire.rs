@@ -15,7 +15,7 @@ pub mod time;
 
 pub use batch::{Batch, BatchFilter, BatchPage, BatchPreview, BatchResult, BatchResultPage, BatchState, BatchWish};
 pub use doors::{AuditLine, AuditPage, LogIn, Rotation, Session, Token, TokenPage, TokenWish, TokenWithSecret};
-pub use job::{Job, JobState, LogLine, Priority, Product, Recording, RecordingSegment, Reprocess};
+pub use job::{Job, JobEvent, JobState, LogLine, Priority, Product, Recording, RecordingSegment, Reprocess};
 pub use lists::{
     Asset, AssetPage, Health, JobPage, LogPage, OptionRange, ProductPage, Recipe, RecipeOption, Rig, RigPage, RunPage,
     Worker,

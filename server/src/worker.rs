@@ -5,13 +5,10 @@
 
 mod attempt;
 mod child;
-mod confinement;
 mod follow;
 mod publish;
 mod scratch;
 mod showcase;
-
-pub use confinement::Confinement;
 
 use std::path::PathBuf;
 use std::time::Duration;
@@ -21,6 +18,7 @@ use tokio::task::JoinSet;
 use tokio_util::sync::CancellationToken;
 
 use crate::config::JobLimits;
+use crate::confinement::Confinement;
 use crate::db::tables::worker;
 use crate::db::{ANSWER_PATIENCE, Db, retried};
 use crate::disk::DiskGuard;
@@ -54,7 +52,7 @@ pub struct Worker {
     pub limits: JobLimits,
     /// The binary that processes: this one.
     pub program: PathBuf,
-    /// How the child is kept from the network.
+    /// How the child is kept from the network and from other files.
     pub confined: Confinement,
     /// Where attempts write.
     pub scratch: PathBuf,

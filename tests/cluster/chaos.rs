@@ -108,10 +108,13 @@ fn wait(dice: &mut Dice, most_ms: usize) {
     std::thread::sleep(Duration::from_millis(dice.throw(most_ms) as u64));
 }
 
+/// Stops a process for a while; the other strikes go on meanwhile.
 fn pause(process: u32) {
     signal("STOP", process);
-    std::thread::sleep(PAUSED);
-    signal("CONT", process);
+    std::thread::spawn(move || {
+        std::thread::sleep(PAUSED);
+        signal("CONT", process);
+    });
 }
 
 /// Sends run `number`, or hears that it is there; `None` where the server went away.
@@ -215,7 +218,7 @@ fn two_hundred_jobs_survive_kill_and_pause_on_postgresql_and_s3() {
     let cluster = Cluster::start();
     let flags = ["--lease-s", LEASE_S];
     let server = cluster.server(&["--workers", "0", flags[0], flags[1]]);
-    let workers = (0..2).map(|_| cluster.worker(&["--slots", "1", flags[0], flags[1]])).collect();
+    let workers = (0..2).map(|_| cluster.worker(&["--slots", "2", flags[0], flags[1]])).collect();
     let mut site = Site::new(server, workers);
     let jobs = storm(&mut site, &mut dice);
     assert_all_done_once(&site, &jobs, &cluster.files());
@@ -248,7 +251,7 @@ fn two_hundred_jobs_survive_kill_and_pause_on_postgresql_and_s3() {
 #[test]
 fn two_hundred_jobs_survive_kill_and_pause_on_sqlite_and_a_folder() {
     let mut dice = Dice::new();
-    let mut site = Site::new(Server::start(&["--workers", "2", "--lease-s", LEASE_S]), Vec::new());
+    let mut site = Site::new(Server::start(&["--workers", "4", "--lease-s", LEASE_S]), Vec::new());
     let jobs = storm(&mut site, &mut dice);
     let files = site.server.data().join("store");
     assert_all_done_once(&site, &jobs, &files);

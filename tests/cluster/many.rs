@@ -29,7 +29,12 @@ fn two_servers_and_three_workers_share_one_postgresql_and_one_s3() {
         let b = scope.spawn(|| cluster.server(&["--workers", "0"]));
         (a.join().expect("a server"), b.join().expect("a server"))
     });
-    let mut workers: Vec<_> = (0..3).map(|_| cluster.worker(&["--slots", "1"])).collect();
+    // Each says on a port of its own how it is.
+    let ports: Vec<u16> = (0..3).map(|_| free_port()).collect();
+    let mut workers: Vec<_> = ports
+        .iter()
+        .map(|port| cluster.worker(&["--slots", "1", "--metrics-listen", &format!("127.0.0.1:{port}")]))
+        .collect();
     eventually("the workers are listed by both servers", || {
         [&a, &b].iter().all(|s| s.json("/api/workers").as_array().is_some_and(|all| slots(all) == 3))
     });
@@ -49,6 +54,8 @@ fn two_servers_and_three_workers_share_one_postgresql_and_one_s3() {
     }
     let by: BTreeSet<_> = cluster.ask("SELECT DISTINCT worker FROM jobs").into_iter().collect();
     assert!(by.len() > 1, "one worker did everything: {by:?}");
+    let done: u64 = ports.iter().map(|port| jobs_done(*port)).sum();
+    assert_eq!(done, jobs.len() as u64, "the workers' own counts");
 
     // The source comes back byte for byte, also by range.
     let run = text(&a.json(&format!("/api/jobs/{}", jobs[0])), "/run");
@@ -71,6 +78,22 @@ fn two_servers_and_three_workers_share_one_postgresql_and_one_s3() {
     eventually("stopped workers are no longer listed", || {
         a.json("/api/workers").as_array().is_some_and(|all| slots(all) == 0)
     });
+}
+
+fn free_port() -> u16 {
+    let listener = std::net::TcpListener::bind("127.0.0.1:0").and_then(|l| l.local_addr());
+    listener.expect("a free port").port()
+}
+
+/// What a worker counted, by its own metrics.
+fn jobs_done(port: u16) -> u64 {
+    let ask = |path: &str| reqwest::blocking::get(format!("http://127.0.0.1:{port}{path}")).expect("it answers");
+    assert_eq!((ask("/livez").status().as_u16(), ask("/readyz").status().as_u16()), (200, 200));
+    assert_eq!(ask("/api/runs").status(), 404, "a worker has no other doors");
+    let metrics = ask("/metrics").text().expect("text");
+    assert!(metrics.ends_with("# EOF\n") && metrics.contains("stria_queue_jobs"), "{metrics}");
+    let done = metrics.lines().find_map(|line| line.strip_prefix("stria_attempts_total{end=\"done\"} "));
+    done.map_or(0, |number| number.parse().expect("a number"))
 }
 
 fn slots(workers: &[Value]) -> u64 {

@@ -13,7 +13,7 @@ const OPEN: [&str; 3] = ["get /livez", "get /readyz", "post /api/session"];
 const SCOPES: [&str; 4] = ["ingest", "read", "operate", "admin"];
 
 /// A token made on the command line, in the server's folder.
-fn token(server: &Server, scopes: &str) -> String {
+pub(super) fn token(server: &Server, scopes: &str) -> String {
     let data = server.data();
     let made =
         run_stria(&["token", "create", "test", "--scopes", scopes, "--data", data.to_str().expect("a plain path")]);
@@ -165,7 +165,7 @@ fn a_token_logs_a_browser_in_through_the_page() {
     let secret = token(&server, "read");
     let client = Client::builder().redirect(reqwest::redirect::Policy::none()).build().expect("a client");
     let page = send(client.get(server.url("/login?next=/runs%22%3E%3Cscript%3E"))).text().expect("text");
-    assert!(page.contains("/runs&quot;>&lt;script>") && !page.contains("<script>"), "{page}");
+    assert!(page.contains("/runs&quot;&gt;&lt;script&gt;") && !page.contains("<script>"), "{page}");
     let form =
         |secret: &str| send(client.post(server.url("/login")).form(&[("secret", secret), ("next", "/runs?a=b")]));
     assert_eq!(form("stria_wrong").status(), 401);

@@ -8,6 +8,7 @@ use super::frame_file::still_format;
 use super::video::{check_size, image};
 use super::{EncodedFormat, Image};
 use crate::error::{Error, Result};
+use crate::rig::MAX_IMAGE_SIDE_PX;
 
 /// Decodes stills one after the other, keeping the decoder of the latest format.
 #[derive(Default)]
@@ -21,7 +22,8 @@ impl StillDecoder {
     /// # Errors
     /// [`Error::Input`] where the bytes are no such image, or its sides are out of range.
     pub(super) fn decode(&mut self, bytes: &[u8], name: &str) -> Result<Image> {
-        let not_an_image = |found: String| Error::input(name, found, "a whole JPEG, PNG or WebP image");
+        let expected = format!("a whole JPEG, PNG or WebP image of 16 to {MAX_IMAGE_SIDE_PX} px a side");
+        let not_an_image = |found: String| Error::input(name, found, expected.clone());
         let format = still_format(bytes).ok_or_else(|| not_an_image("bytes that begin as none".into()))?;
         let (_, mut decoder) = match self.decoder.take() {
             Some((kept, decoder)) if kept == format => (kept, decoder),
@@ -54,5 +56,6 @@ fn open(format: EncodedFormat) -> Result<ffmpeg::decoder::Video> {
     let mut context = ffmpeg::codec::context::Context::new_with_codec(codec);
     // One picture goes in and comes out: threads would keep pictures back.
     context.set_threading(ffmpeg::threading::Config::count(1));
-    context.decoder().open_as(codec).and_then(|opened| opened.video()).map_err(failed)
+    let decoder = context.decoder().open_as_with(codec, super::video::decoder_options());
+    decoder.and_then(|opened| opened.video()).map_err(failed)
 }

@@ -136,7 +136,9 @@ impl Video {
         let mut context = ffmpeg::codec::context::Context::from_parameters(parameters)
             .map_err(|e| Error::input(name, format!("an unusable video stream ({e})"), "a stream FFmpeg decodes"))?;
         context.set_threading(ffmpeg::threading::Config::kind(ffmpeg::threading::Type::Frame));
-        let decoder = context.decoder().video().map_err(|e| {
+        let codec = ffmpeg::decoder::find(stream.parameters().id()).ok_or(ffmpeg::Error::DecoderNotFound);
+        let opened = codec.and_then(|codec| context.decoder().open_as_with(codec, decoder_options()));
+        let decoder = opened.and_then(|opened| opened.video()).map_err(|e| {
             Error::input(name, format!("a video stream without decoder ({e})"), "a stream FFmpeg decodes")
         })?;
         let base = stream.time_base();
@@ -318,6 +320,13 @@ impl Source for VideoFile {
         }
         warnings
     }
+}
+
+/// A picture larger than the largest that is taken is refused before memory is asked for.
+pub(super) fn decoder_options() -> ffmpeg::Dictionary {
+    let mut options = ffmpeg::Dictionary::new();
+    options.set("max_pixels", &(u64::from(MAX_IMAGE_SIDE_PX) * u64::from(MAX_IMAGE_SIDE_PX)).to_string());
+    options
 }
 
 pub(super) fn check_size(name: &str, width_px: u32, height_px: u32) -> Result<()> {

@@ -10,12 +10,13 @@ use tokio_util::sync::CancellationToken;
 
 use super::Failed;
 use crate::config::{GB, JobLimits, Places};
+use crate::confinement::Confinement;
 use crate::db::{DatabasePlace, Db};
 use crate::disk::DiskGuard;
 use crate::error::{Error, Result};
 use crate::queue::Queue;
 use crate::store::{Store, StorePlace};
-use crate::worker::{Confinement, Worker};
+use crate::worker::Worker;
 
 /// Most jobs of one process at the same time.
 const MOST_SLOTS: usize = 1024;

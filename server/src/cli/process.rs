@@ -19,6 +19,7 @@ use stria_core::rig::Rig;
 use self::archived::Archived;
 use super::progress::{JobBar, duration, size};
 use super::{Failed, Outcome, Success};
+use crate::confinement;
 use crate::wire::child::{End, Failure};
 
 /// The exit code of a cancelled process.
@@ -90,10 +91,17 @@ pub(super) struct Process {
     /// End at once when stdin ends: the parent died, or wants an end
     #[arg(long, hide = true)]
     exit_with_stdin: bool,
+    /// Give up every file but the source and this folder, and the network, before anything is read
+    #[arg(long, value_name = "DIR", hide = true)]
+    keep_to: Option<PathBuf>,
 }
 
 impl Process {
     pub(super) fn run(self) -> Outcome {
+        // First of all: threads that are there already would not be fenced.
+        if let Some(folder) = &self.keep_to {
+            confinement::keep_to(&[&self.source], &[folder]).map_err(Failed::Other)?;
+        }
         let stop = Arc::new(AtomicBool::new(false));
         stop_on_signals(stop.clone())?;
         if self.exit_with_stdin {

@@ -53,6 +53,9 @@ pub(super) struct Serve {
     /// A sender may be silent in the middle of a request for so long, seconds; an upload then keeps what came
     #[arg(long, value_name = "S", default_value_t = 60.0, env = "STRIA_SENDER_SILENCE_S")]
     sender_silence_s: f64,
+    /// A client may take so long for the head of a request, and stay connected without one, seconds
+    #[arg(long, value_name = "S", default_value_t = 30.0, env = "STRIA_HEAD_TIMEOUT_S")]
+    head_timeout_s: f64,
     /// An upload that nobody goes on with is kept for so long, hours
     #[arg(long, value_name = "H", default_value_t = 168.0, env = "STRIA_UPLOAD_KEPT_H")]
     upload_kept_h: f64,
@@ -115,6 +118,7 @@ impl Serve {
         let upload_bytes = (positive("--max-upload-gb", self.max_upload_gb, 1e6, "GB")? * GB as f64) as u64;
         let come_back = Duration::from_secs_f64(positive("--live-come-back-s", self.live_come_back_s, 1e6, "s")?);
         let sender_silence = positive("--sender-silence-s", self.sender_silence_s, 86_400.0, "s")?;
+        let head_timeout = positive("--head-timeout-s", self.head_timeout_s, 86_400.0, "s")?;
         let kept_for = positive("--upload-kept-h", self.upload_kept_h, 1e5, "h")? * 3600.0;
         Ok(Config {
             listen: self.listen,
@@ -128,6 +132,7 @@ impl Serve {
             },
             requests: RequestLimits {
                 upload_bytes,
+                head_timeout: Duration::from_secs_f64(head_timeout),
                 sender_silence: Duration::from_secs_f64(sender_silence),
                 disk_reserve_bytes: self.jobs.disk_reserve_bytes()?,
                 per_s: doors.requests_per_s,
@@ -183,6 +188,7 @@ async fn serve(config: Config) -> std::result::Result<(), Failed> {
         store: store.clone(),
         arrivals: Arc::new(Semaphore::new(config.requests.uploads_at_once)),
         config: Arc::new(config.clone()),
+        warnings: Arc::new(if config.workers > 0 { worker.confined.lacks() } else { Vec::new() }),
         stop: stop.clone(),
     };
 

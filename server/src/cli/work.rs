@@ -1,7 +1,9 @@
 //! `stria work`: workers on another machine, on the records and the store that the servers use.
 
 use std::io::Write;
+use std::net::SocketAddr;
 use std::path::PathBuf;
+use std::sync::Arc;
 
 use clap::Args;
 use tokio_util::sync::CancellationToken;
@@ -9,10 +11,15 @@ use tokio_util::sync::CancellationToken;
 use super::engine::{Engine, JobArgs, PlaceArgs, StopSignals, block_on, slots};
 use super::logging::LogArgs;
 use super::{Failed, Outcome, Success};
-use crate::config::{JobLimits, Places};
+use crate::auth::Auth;
+use crate::config::{JobLimits, Places, RequestLimits};
 use crate::db::DatabasePlace;
 use crate::error::Error;
+use crate::http::{self, WorkerApp};
 use crate::store::StorePlace;
+
+/// Connections at the same time of those who ask how a worker is.
+const WATCHERS: usize = 64;
 
 /// Work on the jobs of servers on other machines
 #[derive(Args)]
@@ -27,6 +34,10 @@ pub(super) struct Work {
     /// This worker's own folder: scratch space, and the name by which it finds its jobs again after a crash
     #[arg(long, value_name = "DIR", default_value = "stria-work", env = "STRIA_DATA")]
     data: PathBuf,
+    /// Answer /livez, /readyz and /metrics here, such as 127.0.0.1:9420; asked from another machine, /metrics needs a
+    /// token that may read [default: nowhere]
+    #[arg(long, value_name = "ADDR", env = "STRIA_METRICS_LISTEN")]
+    metrics_listen: Option<SocketAddr>,
     #[command(flatten)]
     jobs: JobArgs,
     #[command(flatten)]
@@ -60,13 +71,19 @@ impl Work {
         let (limits, reserve_bytes) = (self.jobs.limits()?, self.jobs.disk_reserve_bytes()?);
         block_on(async {
             self.log.start()?;
-            work(places, limits, reserve_bytes, slots).await
+            work(places, limits, reserve_bytes, slots, self.metrics_listen).await
         })
         .map(|()| Success::Done)
     }
 }
 
-async fn work(places: Places, limits: JobLimits, reserve_bytes: u64, slots: usize) -> Result<(), Failed> {
+async fn work(
+    places: Places,
+    limits: JobLimits,
+    reserve_bytes: u64,
+    slots: usize,
+    metrics_listen: Option<SocketAddr>,
+) -> Result<(), Failed> {
     let failed = |e: Error| Failed::Other(e.to_string());
     let stop = CancellationToken::new();
     let mut signals = StopSignals::listen().map_err(|e| Failed::Other(format!("signals cannot be heard: {e}")))?;
@@ -74,6 +91,10 @@ async fn work(places: Places, limits: JobLimits, reserve_bytes: u64, slots: usiz
     engine.store.ping().await.map_err(|e| Failed::Other(format!("--store {}: {e}", places.store)))?;
     let worker = engine.worker(&stop).await.map_err(failed)?;
     println!("Worker {} takes {slots} jobs at a time from {}", worker.name, places.database);
+    let answer = match metrics_listen {
+        Some(address) => Some(answer(address, &engine, &worker.confined.lacks(), &stop).await?),
+        None => None,
+    };
     let _ = std::io::stdout().flush();
     let mut work = tokio::spawn(worker.run(slots));
     let ended = tokio::select! {
@@ -91,5 +112,34 @@ async fn work(places: Places, limits: JobLimits, reserve_bytes: u64, slots: usiz
         Ok(result) => result.map_err(failed)?,
         Err(e) => return Err(Failed::Other(format!("the workers stopped: {e}"))),
     }
+    if let Some(answer) = answer {
+        let _ = answer.await;
+    }
     engine.db.close().await.map_err(failed)
+}
+
+/// Says on its own address how this worker is.
+async fn answer(
+    address: SocketAddr,
+    engine: &Engine,
+    warnings: &[String],
+    stop: &CancellationToken,
+) -> Result<tokio::task::JoinHandle<()>, Failed> {
+    let listener = http::connection::listen(address).await.map_err(|e| {
+        Failed::Input(format!("--metrics-listen {address}: {e}; expected a free address of this machine"))
+    })?;
+    let address = listener.local_addr().map_err(|e| Failed::Other(e.to_string()))?;
+    println!("Its counts are at http://{address}/metrics");
+    let app = WorkerApp {
+        listen: address,
+        auth: Auth::new(engine.db.clone()),
+        db: engine.db.clone(),
+        queue: engine.queue.clone(),
+        store: engine.store.clone(),
+        disk: engine.disk.clone(),
+        warnings: Arc::new(warnings.to_vec()),
+        stop: stop.clone(),
+    };
+    let limits = RequestLimits { connections: WATCHERS, ..RequestLimits::default() };
+    Ok(tokio::spawn(http::connection::serve(listener, http::worker_router(app), limits, None, stop.clone())))
 }

@@ -40,6 +40,7 @@ const PIECES_WAIT: usize = 4;
 pub(super) struct ArchiveQuery {
     /// `false`: without the camera's frames.
     frames: Option<bool>,
+    #[param(minimum = 1, maximum = 4_294_967_295, value_type = Option<u64>)]
     /// Only every n-th frame with what was measured in it, and every n-th point of the surface.
     every: Option<u32>,
     /// Only the wall from this chainage on, mm.

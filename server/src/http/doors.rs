@@ -56,8 +56,9 @@ pub(super) fn need_of(method: &Method, path: &str) -> Need {
     let (room, more) = (words.next().unwrap_or_default(), words.next().is_some());
     let reads = matches!(*method, Method::GET | Method::HEAD | Method::OPTIONS);
     match (room, reads) {
-        ("openapi.json", true) => Need::Nothing,
-        ("session", _) if *method == Method::POST => Need::Nothing,
+        ("openapi.json" | "docs", true) => Need::Nothing,
+        // What else there is no method for, nobody needs a token to hear.
+        ("session", _) if !matches!(*method, Method::GET | Method::HEAD | Method::DELETE) => Need::Nothing,
         ("session", _) => Need::Somebody,
         // The list of streams is for those who look; what lies below is the robots'.
         ("live", true) if !more => Need::Scope(Scope::Read),
@@ -234,7 +235,7 @@ fn check_cookie_use(method: &Method, headers: &HeaderMap) -> Result<()> {
 }
 
 /// `Authorization: Bearer …`.
-fn bearer_of(headers: &HeaderMap) -> Option<String> {
+pub(super) fn bearer_of(headers: &HeaderMap) -> Option<String> {
     let value = headers.get(AUTHORIZATION)?.to_str().ok()?;
     let (kind, token) = value.split_once(' ')?;
     kind.eq_ignore_ascii_case("bearer").then(|| token.trim().to_string())

@@ -17,7 +17,7 @@ use super::App;
 use super::extract::Path;
 use super::growing::MOST_BYTES;
 use crate::error::{Error, Result};
-use crate::wire::{Job, JobState, Problem, RecordingSegment};
+use crate::wire::{Job, JobEvent, JobState, Problem, RecordingSegment};
 
 /// Least time between two looks at the records.
 const AT_MOST_EVERY: Duration = Duration::from_millis(200);
@@ -41,7 +41,7 @@ const AT_ONCE: u64 = 500;
 /// has started anew. The stream ends after a final state.
 #[utoipa::path(get, path = "/api/jobs/{job}/events", tag = "jobs",
     params(("job" = String, Path, description = "The job")),
-    responses((status = 200, content_type = "text/event-stream", body = String),
+    responses((status = 200, content_type = "text/event-stream", body = JobEvent),
         (status = 404, body = Problem, content_type = "application/problem+json")))]
 pub(super) async fn stream_events(State(app): State<App>, Path(job): Path<String>) -> Result<Response> {
     app.runs.job(&job).await?;

@@ -1,11 +1,13 @@
 //! Axum's extractors with problem documents for what they refuse.
 
 use axum::extract::{FromRequest, FromRequestParts, Request};
+use axum::http::StatusCode;
 use axum::http::request::Parts;
 use axum::response::{IntoResponse, Response};
 use serde::de::DeserializeOwned;
 
 use super::problem::Refusal;
+use crate::config::RequestLimits;
 use crate::error::Error;
 use crate::runs::Page;
 
@@ -51,6 +53,9 @@ impl<S: Send + Sync, T: DeserializeOwned> FromRequest<S> for Json<T> {
             Ok(axum::Json(value)) => Ok(Json(value)),
             Err(No::MissingJsonContentType(_)) => {
                 Err(Refusal::MediaType { found, expected: "application/json" }.into_response())
+            }
+            Err(No::BytesRejection(e)) if e.status() == StatusCode::PAYLOAD_TOO_LARGE => {
+                Err(Error::TooLarge { limit_bytes: RequestLimits::SMALL_BODY_BYTES as u64 }.into_response())
             }
             Err(e) => {
                 let expected = "a body as /api/openapi.json describes it";

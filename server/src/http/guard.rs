@@ -44,7 +44,7 @@ fn text(headers: &HeaderMap, name: impl axum::http::header::AsHeaderName) -> Opt
 }
 
 /// A server that listens on the loopback only is asked under a name of the loopback only.
-fn check_host(headers: &HeaderMap, authority: Option<&str>, loopback_only: bool) -> Result<(), Error> {
+pub(super) fn check_host(headers: &HeaderMap, authority: Option<&str>, loopback_only: bool) -> Result<(), Error> {
     let Some(host) = text(headers, HOST).or(authority) else {
         return Err(Error::Foreign("the request names no host".into()));
     };

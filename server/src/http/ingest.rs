@@ -16,7 +16,7 @@ use crate::wire::{Problem, Run};
 const FORM_BYTES: u64 = 16 * 1024 * 1024;
 
 /// Longest idempotency key, characters.
-const MAX_KEY_CHARS: usize = 255;
+pub(super) const MAX_KEY_CHARS: usize = 255;
 
 /// A whole run in one request.
 ///

@@ -35,6 +35,7 @@ pub(super) struct ProfileQuery {
     from: Option<String>,
     /// Where it ends: world x,y in mm.
     to: Option<String>,
+    #[param(minimum = 0)]
     /// Way from one point to the next, mm; the map's pixel when nothing is said, or longer for a long line.
     step_mm: Option<f64>,
     /// `json` (when nothing is said) or `csv`.
@@ -44,7 +45,8 @@ pub(super) struct ProfileQuery {
 /// A cross-section of the depth map, in mm: the map's own values along a line, the nearest pixel's at each point.
 #[utoipa::path(get, path = "/api/jobs/{job}/profile", tag = "jobs",
     params(("job" = String, Path, description = "The job"), ProfileQuery),
-    responses((status = 200, body = CrossSection),
+    responses((status = 200, description = "Or as text/csv, by `format`",
+            content((CrossSection = "application/json"), (String = "text/csv"))),
         (status = 400, body = Problem, content_type = "application/problem+json"),
         (status = 404, body = Problem, content_type = "application/problem+json")))]
 pub(super) async fn get_profile(
@@ -113,6 +115,7 @@ fn wire_of(job: String, section: &Section, chainage_mm: impl Fn(f64) -> f64) -> 
 #[serde(deny_unknown_fields)]
 #[into_params(parameter_in = Query)]
 pub(super) struct TrajectoryQuery {
+    #[param(minimum = 2, maximum = 100_000)]
     /// Most frames to answer, 2 to 100,000; 2,000 when nothing is said. Of longer runs every n-th frame is answered.
     frames: Option<u64>,
 }

@@ -15,8 +15,10 @@ use crate::wire::{Pin, Problem, RetentionPreview};
 #[serde(deny_unknown_fields)]
 #[into_params(parameter_in = Query)]
 pub(super) struct PolicyQuery {
+    #[param(minimum = 0, maximum = 1_000_000_000)]
     /// As if runs older than this went, days; the server's own value when nothing is said.
     keep_days: Option<f64>,
+    #[param(minimum = 0, maximum = 1_000_000_000)]
     /// As if the oldest runs went while more than this is stored, GB; the server's own value when nothing is said.
     quota_gb: Option<f64>,
 }

@@ -1,6 +1,8 @@
 //! Stored rigs.
 
+use axum::body::Bytes;
 use axum::extract::State;
+use axum::extract::rejection::BytesRejection;
 use axum::http::StatusCode;
 use axum::response::{IntoResponse, Response};
 
@@ -23,7 +25,15 @@ pub(super) async fn list_rigs(State(app): State<App>, Query(query): Query<PageQu
     responses((status = 201, body = Rig), (status = 200, body = Rig, description = "It was there already"),
         (status = 400, body = Problem, content_type = "application/problem+json"),
         (status = 409, body = Problem, content_type = "application/problem+json", description = "Another of that name is there")))]
-pub(super) async fn create_rig(State(app): State<App>, body: axum::body::Bytes) -> Result<Response> {
+pub(super) async fn create_rig(
+    State(app): State<App>,
+    body: std::result::Result<Bytes, BytesRejection>,
+) -> Result<Response> {
+    let limit_bytes = app.config.requests.small_body_bytes as u64;
+    let body = body.map_err(|e| match e.status() {
+        StatusCode::PAYLOAD_TOO_LARGE => Error::TooLarge { limit_bytes },
+        _ => Error::SenderSilent,
+    })?;
     let text = std::str::from_utf8(&body)
         .map_err(|_| Error::field("rig", "the body is not UTF-8 text", "a rig file in TOML or JSON"))?;
     let (rig, made) = app.runs.store_rig(&RigText::read(text)?).await?;

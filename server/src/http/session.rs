@@ -8,6 +8,7 @@ use serde::Deserialize;
 
 use super::App;
 use super::connection::Peer;
+use super::docs::escaped;
 use super::doors::{COOKIE_NAME, cookie_of, is_secure};
 use super::extract::{Json, Query};
 use super::problem::Refusal;
@@ -145,16 +146,7 @@ fn go_on(cookie: [(axum::http::HeaderName, String); 2], next: Option<&str>) -> R
 }
 
 fn page(status: StatusCode, words: &str, next: Option<&str>) -> Response {
-    let next: String = next
-        .unwrap_or_default()
-        .chars()
-        .map(|c| match c {
-            '&' => "&amp;".into(),
-            '<' => "&lt;".into(),
-            '"' => "&quot;".into(),
-            c => c.to_string(),
-        })
-        .collect();
+    let next = escaped(next.unwrap_or_default());
     let body = format!(
         "<!doctype html><html lang=\"en\"><meta charset=\"utf-8\"><title>Stria: log in</title>\
          <meta name=\"viewport\" content=\"width=device-width\">\

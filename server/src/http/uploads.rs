@@ -27,7 +27,7 @@ use crate::error::{Error, Result};
 use crate::uploads::{Held, NewUpload, Receiving, TAKEN_OVER, Upload};
 use crate::wire::Problem;
 
-const VERSION: &str = "1.0.0";
+pub(super) const VERSION: &str = "1.0.0";
 const EXTENSIONS: &str = "creation,creation-with-upload,creation-defer-length,checksum,expiration,termination";
 const PIECE: &str = "application/offset+octet-stream";
 

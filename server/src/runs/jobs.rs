@@ -153,6 +153,24 @@ fn numeric_cursor(page: &Page) -> Result<Option<i64>> {
     Ok(Some(text.parse::<u32>().map_err(bad)?.into()))
 }
 
+/// What [`content_type`] may answer, without parameters.
+pub const CONTENT_TYPES: [&str; 14] = [
+    "application/json",
+    "application/octet-stream",
+    "image/jpeg",
+    "image/png",
+    "image/tiff",
+    "image/webp",
+    "text/csv",
+    "text/html",
+    "text/plain",
+    "video/mp4",
+    "video/quicktime",
+    "video/webm",
+    "video/x-matroska",
+    "video/x-msvideo",
+];
+
 /// The kind of a file by its name.
 pub fn content_type(name: &str) -> &'static str {
     match name.rsplit_once('.').map_or("", |(_, extension)| extension) {

@@ -196,3 +196,14 @@ pub struct Recording {
     /// The whole recording in one file, once the job is done.
     pub recording: Option<String>,
 }
+
+/// One server-sent event of a job's stream.
+#[derive(Clone, Debug, PartialEq, Serialize, ToSchema)]
+pub struct JobEvent {
+    /// `state`, `progress`, `log`, `segment` or `tile`.
+    pub event: String,
+    /// JSON: a job, a log line, a recording segment, or a tile pyramid's `revision`.
+    pub data: String,
+    /// How long to wait before coming back after a cut, ms.
+    pub retry: Option<u64>,
+}

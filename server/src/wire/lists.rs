@@ -155,4 +155,7 @@ pub struct Health {
     pub status: String,
     /// Stria's version.
     pub version: String,
+    /// What this machine lacks to keep the processing of strangers' videos in its place; absent where it lacks nothing.
+    #[serde(skip_serializing_if = "Vec::is_empty")]
+    pub warnings: Vec<String>,
 }

@@ -71,6 +71,9 @@ impl Child {
             command.arg(format!("--fps={fps}"));
         }
         command.args(["--json", "--live-segments", "--exit-with-stdin"]);
+        if worker.confined.fences_files() {
+            command.arg("--keep-to").arg(scratch.folder());
+        }
         command.current_dir(scratch.folder()).env("TMPDIR", scratch.folder());
         command.stdin(Stdio::piped()).stdout(Stdio::piped()).stderr(Stdio::piped());
         command.process_group(0).kill_on_drop(true);
@@ -211,6 +214,11 @@ fn limit(child: Option<Pid>, memory_bytes: u64) {
     let memory = Rlimit { current: Some(memory_bytes), maximum: Some(memory_bytes) };
     if let Err(error) = prlimit(Some(child), Resource::Data, memory) {
         tracing::warn!(%error, "the memory of a child process could not be limited");
+    }
+    // A hostile video that crashes the decoder must not fill the disk with its memory.
+    let none = Rlimit { current: Some(0), maximum: Some(0) };
+    if let Err(error) = prlimit(Some(child), Resource::Core, none) {
+        tracing::warn!(%error, "a child process may leave a core file behind");
     }
     if let Err(error) = setpriority_process(Some(child), NICENESS) {
         tracing::debug!(%error, "a child process kept its priority");
