@@ -1,5 +1,5 @@
 # Everything a person does with Stria's sources. `make demo` and `make test` need only Debian 12, Rust, Node and make.
-.PHONY: demo test bench bench-exports bench-live bench-upload check setup web build
+.PHONY: demo test bench bench-exports bench-live bench-upload bench-queue check setup web build
 
 # Sets up, builds, makes a realistic run, processes it through the server and says which URL to open.
 demo: build
@@ -27,6 +27,12 @@ bench-live: build
 MB ?= 1000
 bench-upload: build
 	target/python/bin/python tests/bench/upload.py $(MB)
+
+# The queue beside graphile_worker on one PostgreSQL; then its times beside 10,000 and 1,000,000 jobs.
+bench-queue: build
+	cd tests/bench/queue && npm ci --no-audit --no-fund
+	target/python/bin/python tests/bench/queue.py
+	cargo test --release --locked --workspace --bin stria -- --ignored --nocapture scale
 
 # Format, lints and docs as errors.
 check: setup web

@@ -1,10 +1,11 @@
-//! Jobs as leased rows: enqueue, claim, cancel, retry; `queue/lease.rs` holds what the owner of a lease may write,
-//! `queue/lost.rs` finds leases whose worker is gone.
+//! Jobs as leased rows: enqueue, claim, cancel, retry; `queue/lease.rs` holds what the owner of a lease may write
+//! while it works, `queue/ending.rs` its one end, `queue/lost.rs` finds leases whose worker is gone.
 //!
 //! Invariants: a claim and everything that goes with it is one transaction. Every write of a worker carries the
 //! lease's fence, so that a worker that was paused past its lease writes nothing. One transaction publishes exactly
 //! one result. The state of a run's latest job is repeated in the run's row in the same transaction.
 
+mod ending;
 mod lease;
 mod lost;
 mod stats;
@@ -16,7 +17,8 @@ use sea_orm::{
 use tokio::sync::watch;
 use uuid::Uuid;
 
-pub use lease::{Lease, Outcome, Progress, PublishedProduct, Signal};
+pub use ending::{Outcome, PublishedProduct};
+pub use lease::{Lease, Progress, Signal};
 pub use lost::LeaseWatch;
 pub use stats::QueueDepth;
 
@@ -399,6 +401,8 @@ async fn repeat_in_run(records: &impl ConnectionTrait, job: &str, state: JobStat
 
 #[cfg(test)]
 mod model;
+#[cfg(test)]
+mod rate;
 #[cfg(test)]
 mod scale;
 #[cfg(test)]

@@ -28,7 +28,7 @@ use crate::store::Store;
 use crate::wire::time::now_ms;
 
 /// Longest wait of an idle worker before it looks for jobs that another process enqueued, or whose wait is over.
-const LOOK_EVERY: Duration = Duration::from_secs(1);
+pub(crate) const LOOK_EVERY: Duration = Duration::from_secs(1);
 
 /// How long a worker without room on its disk waits before it looks again.
 const DISK_PAUSE: Duration = Duration::from_secs(10);

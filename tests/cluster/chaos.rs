@@ -13,7 +13,7 @@ use stria_tests::support::{eventually, files_below, form, short_run};
 /// Jobs of one loop.
 const JOBS: usize = 200;
 /// Uploads on their way in one step.
-const UPLOADS_A_STEP: usize = 4;
+const UPLOADS_A_STEP: usize = 6;
 /// A worker without a sign of life for this long has lost its job.
 const LEASE_S: &str = "2";
 /// Longer than a lease.
@@ -148,7 +148,7 @@ fn storm(site: &mut Site, dice: &mut Dice) -> Vec<String> {
                     })
                 })
                 .collect();
-            wait(dice, 700);
+            wait(dice, 1600);
             site.strike(dice);
             sent.into_iter().map(|thread| thread.join().expect("no refusal")).collect()
         });

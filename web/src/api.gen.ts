@@ -813,7 +813,10 @@ export interface paths {
             path?: never;
             cookie?: never;
         };
-        /** Records and files can be reached, the disk has room, and the server is not about to stop. */
+        /**
+         * Records and files can be reached, the disk has room, and the server is not about to stop. `warnings` says what this
+         *     machine lacks to keep the processing of strangers' videos in its place.
+         */
         get: operations["get_readyz"];
         put?: never;
         post?: never;
@@ -1027,6 +1030,8 @@ export interface components {
             status: string;
             /** @description Stria's version. */
             version: string;
+            /** @description What this machine lacks to keep the processing of strangers' videos in its place; absent where it lacks nothing. */
+            warnings?: string[];
         };
         /** @description One processing of one run with one rig and one recipe. */
         Job: {
@@ -1091,6 +1096,18 @@ export interface components {
             time_left_s?: number | null;
             /** @description What a person should know. */
             warnings: string[];
+        };
+        /** @description One server-sent event of a job's stream. */
+        JobEvent: {
+            /** @description JSON: a job, a log line, a recording segment, or a tile pyramid's `revision`. */
+            data: string;
+            /** @description `state`, `progress`, `log`, `segment` or `tile`. */
+            event: string;
+            /**
+             * Format: int64
+             * @description How long to wait before coming back after a cut, ms.
+             */
+            retry?: number | null;
         };
         /** @description A page of jobs, the newest first. */
         JobPage: {
@@ -1805,6 +1822,33 @@ export interface operations {
             };
             /** @description The token may not do this, or the request comes from a foreign page */
             403: {
+                headers: {
+                    [name: string]: unknown;
+                };
+                content: {
+                    "application/problem+json": components["schemas"]["Problem"];
+                };
+            };
+            /** @description The sender was silent for too long */
+            408: {
+                headers: {
+                    [name: string]: unknown;
+                };
+                content: {
+                    "application/problem+json": components["schemas"]["Problem"];
+                };
+            };
+            /** @description More bytes than this server takes */
+            413: {
+                headers: {
+                    [name: string]: unknown;
+                };
+                content: {
+                    "application/problem+json": components["schemas"]["Problem"];
+                };
+            };
+            /** @description The body's type does not fit */
+            415: {
                 headers: {
                     [name: string]: unknown;
                 };
@@ -2535,7 +2579,7 @@ export interface operations {
                     [name: string]: unknown;
                 };
                 content: {
-                    "text/event-stream": string;
+                    "text/event-stream": components["schemas"]["JobEvent"];
                 };
             };
             /** @description Nobody that this server knows */
@@ -2604,6 +2648,19 @@ export interface operations {
                 };
                 content: {
                     "application/octet-stream": number[];
+                    "application/json": unknown;
+                    "image/jpeg": string;
+                    "image/png": string;
+                    "image/tiff": string;
+                    "image/webp": string;
+                    "text/csv": string;
+                    "text/html": string;
+                    "text/plain": string;
+                    "video/mp4": string;
+                    "video/quicktime": string;
+                    "video/webm": string;
+                    "video/x-matroska": string;
+                    "video/x-msvideo": string;
                 };
             };
             /** @description Not changed */
@@ -2684,6 +2741,15 @@ export interface operations {
                     "application/json": components["schemas"]["LogPage"];
                 };
             };
+            /** @description The request cannot be used; `field` and `expected` say why */
+            400: {
+                headers: {
+                    [name: string]: unknown;
+                };
+                content: {
+                    "application/problem+json": components["schemas"]["Problem"];
+                };
+            };
             /** @description Nobody that this server knows */
             401: {
                 headers: {
@@ -2755,6 +2821,15 @@ export interface operations {
                     "application/json": components["schemas"]["ProductPage"];
                 };
             };
+            /** @description The request cannot be used; `field` and `expected` say why */
+            400: {
+                headers: {
+                    [name: string]: unknown;
+                };
+                content: {
+                    "application/problem+json": components["schemas"]["Problem"];
+                };
+            };
             /** @description Nobody that this server knows */
             401: {
                 headers: {
@@ -2821,6 +2896,19 @@ export interface operations {
                 };
                 content: {
                     "application/octet-stream": number[];
+                    "application/json": unknown;
+                    "image/jpeg": string;
+                    "image/png": string;
+                    "image/tiff": string;
+                    "image/webp": string;
+                    "text/csv": string;
+                    "text/html": string;
+                    "text/plain": string;
+                    "video/mp4": string;
+                    "video/quicktime": string;
+                    "video/webm": string;
+                    "video/x-matroska": string;
+                    "video/x-msvideo": string;
                 };
             };
             /** @description A range of it */
@@ -2828,7 +2916,22 @@ export interface operations {
                 headers: {
                     [name: string]: unknown;
                 };
-                content?: never;
+                content: {
+                    "application/json": unknown;
+                    "application/octet-stream": string;
+                    "image/jpeg": string;
+                    "image/png": string;
+                    "image/tiff": string;
+                    "image/webp": string;
+                    "text/csv": string;
+                    "text/html": string;
+                    "text/plain": string;
+                    "video/mp4": string;
+                    "video/quicktime": string;
+                    "video/webm": string;
+                    "video/x-matroska": string;
+                    "video/x-msvideo": string;
+                };
             };
             /** @description Not changed */
             304: {
@@ -2914,12 +3017,14 @@ export interface operations {
         };
         requestBody?: never;
         responses: {
+            /** @description Or as text/csv, by `format` */
             200: {
                 headers: {
                     [name: string]: unknown;
                 };
                 content: {
                     "application/json": components["schemas"]["CrossSection"];
+                    "text/csv": string;
                 };
             };
             400: {
@@ -3218,6 +3323,19 @@ export interface operations {
                 };
                 content: {
                     "application/octet-stream": number[];
+                    "application/json": unknown;
+                    "image/jpeg": string;
+                    "image/png": string;
+                    "image/tiff": string;
+                    "image/webp": string;
+                    "text/csv": string;
+                    "text/html": string;
+                    "text/plain": string;
+                    "video/mp4": string;
+                    "video/quicktime": string;
+                    "video/webm": string;
+                    "video/x-matroska": string;
+                    "video/x-msvideo": string;
                 };
             };
             /** @description A range of it */
@@ -3225,7 +3343,22 @@ export interface operations {
                 headers: {
                     [name: string]: unknown;
                 };
-                content?: never;
+                content: {
+                    "application/json": unknown;
+                    "application/octet-stream": string;
+                    "image/jpeg": string;
+                    "image/png": string;
+                    "image/tiff": string;
+                    "image/webp": string;
+                    "text/csv": string;
+                    "text/html": string;
+                    "text/plain": string;
+                    "video/mp4": string;
+                    "video/quicktime": string;
+                    "video/webm": string;
+                    "video/x-matroska": string;
+                    "video/x-msvideo": string;
+                };
             };
             /** @description Not changed */
             304: {
@@ -3560,6 +3693,24 @@ export interface operations {
                 };
             };
             408: {
+                headers: {
+                    [name: string]: unknown;
+                };
+                content: {
+                    "application/problem+json": components["schemas"]["Problem"];
+                };
+            };
+            /** @description More bytes than this server takes */
+            413: {
+                headers: {
+                    [name: string]: unknown;
+                };
+                content: {
+                    "application/problem+json": components["schemas"]["Problem"];
+                };
+            };
+            /** @description The body's type does not fit */
+            415: {
                 headers: {
                     [name: string]: unknown;
                 };
@@ -3905,8 +4056,35 @@ export interface operations {
                     "application/problem+json": components["schemas"]["Problem"];
                 };
             };
+            /** @description The sender was silent for too long */
+            408: {
+                headers: {
+                    [name: string]: unknown;
+                };
+                content: {
+                    "application/problem+json": components["schemas"]["Problem"];
+                };
+            };
             /** @description Another of that name is there */
             409: {
+                headers: {
+                    [name: string]: unknown;
+                };
+                content: {
+                    "application/problem+json": components["schemas"]["Problem"];
+                };
+            };
+            /** @description More bytes than this server takes */
+            413: {
+                headers: {
+                    [name: string]: unknown;
+                };
+                content: {
+                    "application/problem+json": components["schemas"]["Problem"];
+                };
+            };
+            /** @description The body's type does not fit */
+            415: {
                 headers: {
                     [name: string]: unknown;
                 };
@@ -4173,6 +4351,15 @@ export interface operations {
                     "application/problem+json": components["schemas"]["Problem"];
                 };
             };
+            /** @description The body's type does not fit */
+            415: {
+                headers: {
+                    [name: string]: unknown;
+                };
+                content: {
+                    "application/problem+json": components["schemas"]["Problem"];
+                };
+            };
             /** @description The key was used before with other content */
             422: {
                 headers: {
@@ -4400,8 +4587,35 @@ export interface operations {
                     "application/problem+json": components["schemas"]["Problem"];
                 };
             };
+            /** @description The sender was silent for too long */
+            408: {
+                headers: {
+                    [name: string]: unknown;
+                };
+                content: {
+                    "application/problem+json": components["schemas"]["Problem"];
+                };
+            };
             /** @description Somebody else has changed it */
             412: {
+                headers: {
+                    [name: string]: unknown;
+                };
+                content: {
+                    "application/problem+json": components["schemas"]["Problem"];
+                };
+            };
+            /** @description More bytes than this server takes */
+            413: {
+                headers: {
+                    [name: string]: unknown;
+                };
+                content: {
+                    "application/problem+json": components["schemas"]["Problem"];
+                };
+            };
+            /** @description The body's type does not fit */
+            415: {
                 headers: {
                     [name: string]: unknown;
                 };
@@ -4483,6 +4697,33 @@ export interface operations {
                 };
             };
             404: {
+                headers: {
+                    [name: string]: unknown;
+                };
+                content: {
+                    "application/problem+json": components["schemas"]["Problem"];
+                };
+            };
+            /** @description The sender was silent for too long */
+            408: {
+                headers: {
+                    [name: string]: unknown;
+                };
+                content: {
+                    "application/problem+json": components["schemas"]["Problem"];
+                };
+            };
+            /** @description More bytes than this server takes */
+            413: {
+                headers: {
+                    [name: string]: unknown;
+                };
+                content: {
+                    "application/problem+json": components["schemas"]["Problem"];
+                };
+            };
+            /** @description The body's type does not fit */
+            415: {
                 headers: {
                     [name: string]: unknown;
                 };
@@ -4734,6 +4975,19 @@ export interface operations {
                 };
                 content: {
                     "application/octet-stream": number[];
+                    "application/json": unknown;
+                    "image/jpeg": string;
+                    "image/png": string;
+                    "image/tiff": string;
+                    "image/webp": string;
+                    "text/csv": string;
+                    "text/html": string;
+                    "text/plain": string;
+                    "video/mp4": string;
+                    "video/quicktime": string;
+                    "video/webm": string;
+                    "video/x-matroska": string;
+                    "video/x-msvideo": string;
                 };
             };
             /** @description A range of it */
@@ -4741,7 +4995,22 @@ export interface operations {
                 headers: {
                     [name: string]: unknown;
                 };
-                content?: never;
+                content: {
+                    "application/json": unknown;
+                    "application/octet-stream": string;
+                    "image/jpeg": string;
+                    "image/png": string;
+                    "image/tiff": string;
+                    "image/webp": string;
+                    "text/csv": string;
+                    "text/html": string;
+                    "text/plain": string;
+                    "video/mp4": string;
+                    "video/quicktime": string;
+                    "video/webm": string;
+                    "video/x-matroska": string;
+                    "video/x-msvideo": string;
+                };
             };
             /** @description Not changed */
             304: {
@@ -4899,6 +5168,33 @@ export interface operations {
             };
             /** @description The token may not do this, or the request comes from a foreign page */
             403: {
+                headers: {
+                    [name: string]: unknown;
+                };
+                content: {
+                    "application/problem+json": components["schemas"]["Problem"];
+                };
+            };
+            /** @description The sender was silent for too long */
+            408: {
+                headers: {
+                    [name: string]: unknown;
+                };
+                content: {
+                    "application/problem+json": components["schemas"]["Problem"];
+                };
+            };
+            /** @description More bytes than this server takes */
+            413: {
+                headers: {
+                    [name: string]: unknown;
+                };
+                content: {
+                    "application/problem+json": components["schemas"]["Problem"];
+                };
+            };
+            /** @description The body's type does not fit */
+            415: {
                 headers: {
                     [name: string]: unknown;
                 };
@@ -5095,6 +5391,33 @@ export interface operations {
                     "application/problem+json": components["schemas"]["Problem"];
                 };
             };
+            /** @description The sender was silent for too long */
+            408: {
+                headers: {
+                    [name: string]: unknown;
+                };
+                content: {
+                    "application/problem+json": components["schemas"]["Problem"];
+                };
+            };
+            /** @description More bytes than this server takes */
+            413: {
+                headers: {
+                    [name: string]: unknown;
+                };
+                content: {
+                    "application/problem+json": components["schemas"]["Problem"];
+                };
+            };
+            /** @description The body's type does not fit */
+            415: {
+                headers: {
+                    [name: string]: unknown;
+                };
+                content: {
+                    "application/problem+json": components["schemas"]["Problem"];
+                };
+            };
             /** @description Too many requests; `Retry-After` says when to come back */
             429: {
                 headers: {
@@ -5239,8 +5562,35 @@ export interface operations {
                     "application/problem+json": components["schemas"]["Problem"];
                 };
             };
+            /** @description The sender was silent for too long */
+            408: {
+                headers: {
+                    [name: string]: unknown;
+                };
+                content: {
+                    "application/problem+json": components["schemas"]["Problem"];
+                };
+            };
             /** @description It is no longer valid */
             409: {
+                headers: {
+                    [name: string]: unknown;
+                };
+                content: {
+                    "application/problem+json": components["schemas"]["Problem"];
+                };
+            };
+            /** @description More bytes than this server takes */
+            413: {
+                headers: {
+                    [name: string]: unknown;
+                };
+                content: {
+                    "application/problem+json": components["schemas"]["Problem"];
+                };
+            };
+            /** @description The body's type does not fit */
+            415: {
                 headers: {
                     [name: string]: unknown;
                 };
@@ -5273,7 +5623,7 @@ export interface operations {
             query?: never;
             header: {
                 /** @description 1.0.0 */
-                "Tus-Resumable": string;
+                "Tus-Resumable": "1.0.0";
                 /** @description Size of the file, bytes */
                 "Upload-Length"?: number | null;
                 /** @description 1: the size follows later */
@@ -5327,6 +5677,15 @@ export interface operations {
                     "application/problem+json": components["schemas"]["Problem"];
                 };
             };
+            /** @description The sender was silent for too long */
+            408: {
+                headers: {
+                    [name: string]: unknown;
+                };
+                content: {
+                    "application/problem+json": components["schemas"]["Problem"];
+                };
+            };
             412: {
                 headers: {
                     [name: string]: unknown;
@@ -5336,6 +5695,15 @@ export interface operations {
                 };
             };
             413: {
+                headers: {
+                    [name: string]: unknown;
+                };
+                content: {
+                    "application/problem+json": components["schemas"]["Problem"];
+                };
+            };
+            /** @description The body's type does not fit */
+            415: {
                 headers: {
                     [name: string]: unknown;
                 };
@@ -5413,6 +5781,15 @@ export interface operations {
                     "application/problem+json": components["schemas"]["Problem"];
                 };
             };
+            /** @description Another version of tus than 1.0.0; `Tus-Version` says which one is spoken */
+            412: {
+                headers: {
+                    [name: string]: unknown;
+                };
+                content: {
+                    "application/problem+json": components["schemas"]["Problem"];
+                };
+            };
             /** @description Too many requests; `Retry-After` says when to come back */
             429: {
                 headers: {
@@ -5438,7 +5815,7 @@ export interface operations {
             query?: never;
             header: {
                 /** @description PATCH, HEAD or DELETE */
-                "X-HTTP-Method-Override": string;
+                "X-HTTP-Method-Override": "PATCH" | "HEAD" | "DELETE";
             };
             path: {
                 /** @description The upload */
@@ -5453,6 +5830,15 @@ export interface operations {
                     [name: string]: unknown;
                 };
                 content?: never;
+            };
+            /** @description The request cannot be used; `field` and `expected` say why */
+            400: {
+                headers: {
+                    [name: string]: unknown;
+                };
+                content: {
+                    "application/problem+json": components["schemas"]["Problem"];
+                };
             };
             /** @description Nobody that this server knows */
             401: {
@@ -5473,6 +5859,15 @@ export interface operations {
                 };
             };
             405: {
+                headers: {
+                    [name: string]: unknown;
+                };
+                content: {
+                    "application/problem+json": components["schemas"]["Problem"];
+                };
+            };
+            /** @description Another version of tus than 1.0.0; `Tus-Version` says which one is spoken */
+            412: {
                 headers: {
                     [name: string]: unknown;
                 };
@@ -5505,7 +5900,7 @@ export interface operations {
             query?: never;
             header: {
                 /** @description 1.0.0 */
-                "Tus-Resumable": string;
+                "Tus-Resumable": "1.0.0";
             };
             path: {
                 /** @description The upload */
@@ -5520,6 +5915,15 @@ export interface operations {
                     [name: string]: unknown;
                 };
                 content?: never;
+            };
+            /** @description The request cannot be used; `field` and `expected` say why */
+            400: {
+                headers: {
+                    [name: string]: unknown;
+                };
+                content: {
+                    "application/problem+json": components["schemas"]["Problem"];
+                };
             };
             /** @description Nobody that this server knows */
             401: {
@@ -5548,6 +5952,15 @@ export interface operations {
                 };
             };
             410: {
+                headers: {
+                    [name: string]: unknown;
+                };
+                content: {
+                    "application/problem+json": components["schemas"]["Problem"];
+                };
+            };
+            /** @description Another version of tus than 1.0.0; `Tus-Version` says which one is spoken */
+            412: {
                 headers: {
                     [name: string]: unknown;
                 };
@@ -5620,6 +6033,15 @@ export interface operations {
                     "application/problem+json": components["schemas"]["Problem"];
                 };
             };
+            /** @description Another version of tus than 1.0.0; `Tus-Version` says which one is spoken */
+            412: {
+                headers: {
+                    [name: string]: unknown;
+                };
+                content: {
+                    "application/problem+json": components["schemas"]["Problem"];
+                };
+            };
             /** @description Too many requests; `Retry-After` says when to come back */
             429: {
                 headers: {
@@ -5645,7 +6067,7 @@ export interface operations {
             query?: never;
             header: {
                 /** @description 1.0.0 */
-                "Tus-Resumable": string;
+                "Tus-Resumable": "1.0.0";
             };
             path: {
                 /** @description The upload */
@@ -5661,6 +6083,15 @@ export interface operations {
                     [name: string]: unknown;
                 };
                 content?: never;
+            };
+            /** @description The request cannot be used; `field` and `expected` say why */
+            400: {
+                headers: {
+                    [name: string]: unknown;
+                };
+                content: {
+                    "application/problem+json": components["schemas"]["Problem"];
+                };
             };
             /** @description Nobody that this server knows */
             401: {
@@ -5691,6 +6122,15 @@ export interface operations {
                     [name: string]: unknown;
                 };
                 content?: never;
+            };
+            /** @description Another version of tus than 1.0.0; `Tus-Version` says which one is spoken */
+            412: {
+                headers: {
+                    [name: string]: unknown;
+                };
+                content: {
+                    "application/problem+json": components["schemas"]["Problem"];
+                };
             };
             423: {
                 headers: {
@@ -5729,7 +6169,7 @@ export interface operations {
             query?: never;
             header: {
                 /** @description 1.0.0 */
-                "Tus-Resumable": string;
+                "Tus-Resumable": "1.0.0";
                 /** @description Where the piece begins: the upload's offset */
                 "Upload-Offset": number;
                 /** @description Size of the file, where it was deferred */
@@ -5790,6 +6230,15 @@ export interface operations {
                     "application/problem+json": components["schemas"]["Problem"];
                 };
             };
+            /** @description The sender was silent for too long */
+            408: {
+                headers: {
+                    [name: string]: unknown;
+                };
+                content: {
+                    "application/problem+json": components["schemas"]["Problem"];
+                };
+            };
             409: {
                 headers: {
                     [name: string]: unknown;
@@ -5799,6 +6248,15 @@ export interface operations {
                 };
             };
             410: {
+                headers: {
+                    [name: string]: unknown;
+                };
+                content: {
+                    "application/problem+json": components["schemas"]["Problem"];
+                };
+            };
+            /** @description Another version of tus than 1.0.0; `Tus-Version` says which one is spoken */
+            412: {
                 headers: {
                     [name: string]: unknown;
                 };

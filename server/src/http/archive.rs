@@ -29,6 +29,8 @@ const NAME: &str = "archive.mcap";
 /// Parts that are made at the same time, at most: each keeps a core busy.
 const PARTS_AT_ONCE: usize = 2;
 static PARTS: Semaphore = Semaphore::const_new(PARTS_AT_ONCE);
+/// Frames from one that is kept to the next, at most.
+const MOST_EVERY: u32 = 1_000_000;
 /// Bytes that are sent at once, about.
 const PIECE_BYTES: usize = 256 * 1024;
 /// Pieces that wait for a slow reader, at most.
@@ -40,7 +42,7 @@ const PIECES_WAIT: usize = 4;
 pub(super) struct ArchiveQuery {
     /// `false`: without the camera's frames.
     frames: Option<bool>,
-    #[param(minimum = 1, maximum = 4_294_967_295, value_type = Option<u64>)]
+    #[param(minimum = 1, maximum = 1_000_000)]
     /// Only every n-th frame with what was measured in it, and every n-th point of the surface.
     every: Option<u32>,
     /// Only the wall from this chainage on, mm.
@@ -86,8 +88,8 @@ pub(super) async fn get_archive(
 impl ArchiveQuery {
     fn cut(&self, start_mm: f64, direction: Direction) -> Result<ArchiveCut> {
         let every = self.every.unwrap_or(1);
-        if every == 0 {
-            return Err(Error::field("every", "0", "1 or more"));
+        if !(1..=MOST_EVERY).contains(&every) {
+            return Err(Error::field("every", format!("every is {every}"), format!("1 to {MOST_EVERY}")));
         }
         let (from_mm, to_mm) = (self.from_mm.unwrap_or(f64::NEG_INFINITY), self.to_mm.unwrap_or(f64::INFINITY));
         if from_mm.is_nan() || to_mm.is_nan() || from_mm > to_mm {

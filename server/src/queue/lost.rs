@@ -5,7 +5,8 @@ use std::time::{Duration, Instant};
 
 use sea_orm::{ActiveValue::Set, ColumnTrait, Condition, EntityTrait, QueryFilter, QuerySelect};
 
-use super::lease::{add_log_line, ended, problem_of, requeued};
+use super::ending::{ended, problem_of, requeued};
+use super::lease::add_log_line;
 use super::{Queue, mark_unpublished, repeat_in_run};
 use crate::db::tables::{job, segment};
 use crate::db::{ANSWER_PATIENCE, retried};

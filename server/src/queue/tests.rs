@@ -13,7 +13,7 @@ use crate::wire::child::Failure;
 pub(super) struct Records {
     pub(super) queue: Queue,
     pub(super) db: Db,
-    _folder: tempfile::TempDir,
+    _folder: Option<tempfile::TempDir>,
 }
 
 pub(super) async fn records(limits: JobLimits) -> Records {
@@ -21,10 +21,14 @@ pub(super) async fn records(limits: JobLimits) -> Records {
     let db = Db::open(&DatabasePlace::Sqlite(folder.path().join("stria.db"))).await.expect("opens");
     let row = asset::ActiveModel { name: Set("wall".into()), created_ms: Set(0) };
     asset::Entity::insert(row).exec_without_returning(db.read()).await.expect("inserts");
-    Records { queue: Queue::new(db.clone(), limits), db, _folder: folder }
+    Records { _folder: Some(folder), ..Records::on(db, limits) }
 }
 
 impl Records {
+    pub(super) fn on(db: Db, limits: JobLimits) -> Records {
+        Records { queue: Queue::new(db.clone(), limits), db, _folder: None }
+    }
+
     pub(super) async fn add(&self, priority: Priority) -> String {
         let run = Queue::new_id();
         let row = run::ActiveModel {
