@@ -6,6 +6,7 @@ mod service {
     mod commands;
     mod confined;
     mod crashes;
+    mod defects;
     mod doors;
     mod jobs;
     mod keeping;

@@ -59,10 +59,18 @@ impl Run {
     /// # Panics
     /// Where it cannot be simulated.
     pub fn simulate(seconds: &str, fps: &str, size: &str) -> Run {
+        Run::simulate_with(&["--seconds", seconds, "--fps", fps, "--size", size])
+    }
+
+    /// A run along a wall, with more said about it.
+    ///
+    /// # Panics
+    /// Where it cannot be simulated.
+    pub fn simulate_with(options: &[&str]) -> Run {
         let folder = tempfile::tempdir().expect("a temporary folder");
         let out = folder.path().join("run");
         let text = out.to_str().expect("a plain path");
-        let made = run_stria(&["simulate", "wall", "--seconds", seconds, "--fps", fps, "--size", size, "--out", text]);
+        let made = run_stria(&[&["simulate", "wall", "--out", text], options].concat());
         assert!(made.status.success(), "stria simulate: {}", String::from_utf8_lossy(&made.stderr));
         Run { video: out.join("video.mp4"), rig: out.join("rig.toml"), _folder: folder }
     }

@@ -4,7 +4,9 @@
 
 mod archive;
 mod batches;
+mod change;
 pub mod connection;
+mod defects;
 mod docs;
 mod document;
 mod doors;
@@ -36,6 +38,7 @@ mod worker;
 
 use std::sync::Arc;
 
+pub use change::Changes;
 pub use doors::Rates;
 pub use worker::{WorkerApp, worker_router};
 
@@ -53,6 +56,7 @@ use utoipa_axum::routes;
 use crate::auth::Auth;
 use crate::batches::Batches;
 use crate::config::Config;
+use crate::defects::Defects;
 use crate::disk::DiskGuard;
 use crate::error::Error;
 use crate::live::Live;
@@ -74,6 +78,10 @@ pub struct App {
     pub queue: Queue,
     /// Reprocessing in bulk.
     pub batches: Batches,
+    /// Defects over all runs.
+    pub defects: Defects,
+    /// What changed between jobs.
+    pub changes: Changes,
     /// The files.
     pub store: Store,
     /// Limits and folders.
@@ -136,6 +144,12 @@ fn routes() -> OpenApiRouter<App> {
         .routes(routes!(lists::list_recipes))
         .routes(routes!(lists::list_options))
         .routes(routes!(lists::list_workers))
+        .routes(routes!(defects::list_defects))
+        .routes(routes!(defects::get_csv))
+        .routes(routes!(defects::get_geojson))
+        .routes(routes!(defects::get_defect, defects::change_defect))
+        .routes(routes!(defects::get_history))
+        .routes(routes!(change::get_change))
         .routes(routes!(retention::preview_retention))
         .routes(routes!(retention::get_pin, retention::pin_run, retention::unpin_run))
         .routes(routes!(batches::list_batches, batches::create_batch))

@@ -10,6 +10,7 @@ pub mod cli;
 pub mod config;
 pub mod confinement;
 pub mod db;
+pub mod defects;
 pub mod disk;
 pub mod error;
 pub mod http;

@@ -11,11 +11,12 @@ use sea_orm::{ActiveValue::Set, ColumnTrait, ConnectionTrait, EntityTrait, Query
 use serde::{Deserialize, Serialize};
 
 pub use jobs::{CONTENT_TYPES, StoredFile, content_type};
-pub use listing::{Page, RunFilter, RunSort};
+pub use listing::{Page, RunFilter, RunSort, with_words};
 pub use rigs::{RecipeText, RigText, built_in_recipes, options};
 
 use crate::db::tables::{asset, idempotency_key, job, log_line, pin, product, run, segment, unpublished};
 use crate::db::{ANSWER_PATIENCE, Db, retried};
+use crate::defects;
 use crate::error::{Error, Result};
 use crate::incoming::Incoming;
 use crate::queue::{self, NewJob, Queue};
@@ -356,7 +357,7 @@ impl Runs {
         if versions.is_some_and(|versions| !versions.contains(&listing::version_of(&row))) {
             return Err(Error::Changed("what is said about the run has changed since it was read".into()));
         }
-        let mut set = run::ActiveModel { id: Set(row.id), note: Set(row.note), ..Default::default() };
+        let mut set = run::ActiveModel { id: Set(row.id.clone()), note: Set(row.note.clone()), ..Default::default() };
         if let Some(name) = change.asset {
             let name = name.trim().to_string();
             check_name("asset", &name)?;
@@ -378,6 +379,7 @@ impl Runs {
             set.note = Set(note);
         }
         run::Entity::update_many().set(set).filter(run::Column::Id.eq(id)).exec(&*t).await?;
+        defects::run_changed(&*t, &row).await?;
         self.forget_asset_without_runs(&*t, &row.asset).await?;
         t.commit().await?;
         self.queue.bell().ring();

@@ -4,6 +4,7 @@
 
 mod batch;
 pub mod child;
+mod defect;
 mod doors;
 mod job;
 mod lists;
@@ -14,6 +15,10 @@ mod run;
 pub mod time;
 
 pub use batch::{Batch, BatchFilter, BatchPage, BatchPreview, BatchResult, BatchResultPage, BatchState, BatchWish};
+pub use defect::{
+    Change, ChangeReport, Defect, DefectChange, DefectHistory, DefectPage, DefectSighting, DefectState, Registration,
+    SameDefect,
+};
 pub use doors::{AuditLine, AuditPage, LogIn, Rotation, Session, Token, TokenPage, TokenWish, TokenWithSecret};
 pub use job::{Job, JobEvent, JobState, LogLine, Priority, Product, Recording, RecordingSegment, Reprocess};
 pub use lists::{

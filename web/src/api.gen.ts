@@ -141,6 +141,95 @@ export interface paths {
         patch?: never;
         trace?: never;
     };
+    "/api/defects": {
+        parameters: {
+            query?: never;
+            header?: never;
+            path?: never;
+            cookie?: never;
+        };
+        /** Defects of all runs, those of the newest jobs first or in another order. */
+        get: operations["list_defects"];
+        put?: never;
+        post?: never;
+        delete?: never;
+        options?: never;
+        head?: never;
+        patch?: never;
+        trace?: never;
+    };
+    "/api/defects.csv": {
+        parameters: {
+            query?: never;
+            header?: never;
+            path?: never;
+            cookie?: never;
+        };
+        /** The filtered defects as CSV, up to 50,000; `cursor` and `limit` have no say. */
+        get: operations["get_csv"];
+        put?: never;
+        post?: never;
+        delete?: never;
+        options?: never;
+        head?: never;
+        patch?: never;
+        trace?: never;
+    };
+    "/api/defects.geojson": {
+        parameters: {
+            query?: never;
+            header?: never;
+            path?: never;
+            cookie?: never;
+        };
+        /**
+         * The filtered defects as GeoJSON, up to 50,000. The coordinates are the asset's own, no places on Earth: x is the chainage
+         *     in metres; y is the height in metres on a wall and the clock position in hours in a pipe, as each feature's `y_is` says.
+         */
+        get: operations["get_geojson"];
+        put?: never;
+        post?: never;
+        delete?: never;
+        options?: never;
+        head?: never;
+        patch?: never;
+        trace?: never;
+    };
+    "/api/defects/{defect}": {
+        parameters: {
+            query?: never;
+            header?: never;
+            path?: never;
+            cookie?: never;
+        };
+        /** A defect. */
+        get: operations["get_defect"];
+        put?: never;
+        post?: never;
+        delete?: never;
+        options?: never;
+        head?: never;
+        /** Changes what people say about a defect: its state, a comment. */
+        patch: operations["change_defect"];
+        trace?: never;
+    };
+    "/api/defects/{defect}/history": {
+        parameters: {
+            query?: never;
+            header?: never;
+            path?: never;
+            cookie?: never;
+        };
+        /** One defect over all runs of its asset that go the same way, matched by place and by the defects around it. */
+        get: operations["get_history"];
+        put?: never;
+        post?: never;
+        delete?: never;
+        options?: never;
+        head?: never;
+        patch?: never;
+        trace?: never;
+    };
     "/api/jobs": {
         parameters: {
             query?: never;
@@ -206,6 +295,26 @@ export interface paths {
         put?: never;
         /** Asks a job to stop. A waiting job is cancelled at once, a running one within a second. */
         post: operations["cancel_job"];
+        delete?: never;
+        options?: never;
+        head?: never;
+        patch?: never;
+        trace?: never;
+    };
+    "/api/jobs/{job}/change": {
+        parameters: {
+            query?: never;
+            header?: never;
+            path?: never;
+            cookie?: never;
+        };
+        /**
+         * What changed from an earlier job to this one: the same asset, the same direction. A comparison that takes longer than
+         *     some seconds is answered with 202 and goes on; whoever asks again gets it.
+         */
+        get: operations["get_change"];
+        put?: never;
+        post?: never;
         delete?: never;
         options?: never;
         head?: never;
@@ -978,6 +1087,113 @@ export interface components {
             /** @description The runs one by one. */
             runs?: string[] | null;
         };
+        /** @description One place that changed. */
+        Change: {
+            /**
+             * Format: double
+             * @description Its depth there, mm.
+             */
+            after_depth_mm?: number | null;
+            /**
+             * Format: int32
+             * @description The defect's number in the later job.
+             */
+            after_number?: number | null;
+            /**
+             * Format: double
+             * @description Area, mm².
+             */
+            area_mm2: number;
+            /**
+             * Format: double
+             * @description Its depth there, mm.
+             */
+            before_depth_mm?: number | null;
+            /**
+             * Format: int32
+             * @description The defect's number in the earlier job.
+             */
+            before_number?: number | null;
+            /**
+             * Format: double
+             * @description Chainage of its middle by the earlier run, mm.
+             */
+            chainage_mm: number;
+            /**
+             * Format: double
+             * @description Clock position on a pipe, h.
+             */
+            clock_h?: number | null;
+            /**
+             * Format: double
+             * @description How sure it is, 0 to 1.
+             */
+            confidence: number;
+            /**
+             * Format: double
+             * @description Greatest change, mm; above 0 away from the camera.
+             */
+            delta_depth_mm: number;
+            /**
+             * Format: double
+             * @description Height on a wall, mm.
+             */
+            height_mm?: number | null;
+            /**
+             * Format: int32
+             * @description From 1.
+             */
+            id: number;
+            /** @description `new`, `grown`, `shrunk`, `vanished`, or `changed` where neither job lists a defect. */
+            state: string;
+            /**
+             * Format: double
+             * @description Volume, mm³.
+             */
+            volume_mm3: number;
+            /**
+             * Format: double
+             * @description World x of its middle in the earlier run, mm.
+             */
+            x_mm: number;
+            /**
+             * Format: double
+             * @description World y of it, mm.
+             */
+            y_mm: number;
+        };
+        /** @description What changed from one job to a later one of the same asset. */
+        ChangeReport: {
+            /** @description The later job. */
+            after: string;
+            /** @description The earlier job. */
+            before: string;
+            /** @description What changed, in the order of the earlier run's chainage. */
+            changes: components["schemas"]["Change"][];
+            /**
+             * Format: double
+             * @description Changes are claimed from this difference on, on an even surface, mm.
+             */
+            claimed_from_mm: number;
+            /**
+             * Format: double
+             * @description Area that both measured, mm².
+             */
+            compared_area_mm2: number;
+            /**
+             * Format: double
+             * @description 95 % of an unchanged, even surface differs by less, mm.
+             */
+            level_of_detection_mm: number;
+            /** @description How the two were laid on each other. */
+            registration: components["schemas"]["Registration"];
+            /** @description Defects of both that did not change. */
+            unchanged: components["schemas"]["SameDefect"][];
+            /** @description The same of the later job's. */
+            unsure_after: number[];
+            /** @description Numbers of the earlier job's defects without a partner, of which no change can be told. */
+            unsure_before: number[];
+        };
         /** @description A cross-section of a depth map: one entry a point in every list. */
         CrossSection: {
             /** @description Position along the asset, mm. */
@@ -1003,6 +1219,157 @@ export interface components {
             /** @description World z as `depth.tif` has it at the nearest pixel, mm; null where nothing was measured. */
             z_mm: (number | null)[];
         };
+        /** @description A defect that a job found, and what people say about it. */
+        Defect: {
+            /**
+             * Format: double
+             * @description Area, mm².
+             */
+            area_mm2: number;
+            /** @description The pipe or wall. */
+            asset: string;
+            /** @description It reaches the edge of what was seen, and may be larger. */
+            at_edge: boolean;
+            /** @description The defect of an earlier job of this run that people said it of: one of the same kind at the same place. */
+            carried_from?: string | null;
+            /**
+             * Format: double
+             * @description Chainage of its middle, mm, by what the run says now.
+             */
+            chainage_mm: number;
+            /** @description When people last changed state or comment (RFC 3339). */
+            changed_at?: string | null;
+            /** @description Who did: the name of a token or a session. */
+            changed_by?: string | null;
+            /**
+             * Format: double
+             * @description Clock position on a pipe, seen along the rising chainage, h.
+             */
+            clock_h?: number | null;
+            /** @description The operator's own code, where the recipe gives one. */
+            code?: string | null;
+            /** @description What people wrote. */
+            comment: string;
+            /**
+             * Format: double
+             * @description How sure it is, 0 to 1.
+             */
+            confidence: number;
+            /** @description The job is the run's latest that is done. */
+            current: boolean;
+            /**
+             * Format: double
+             * @description Deepest (above 0: away from the camera) or highest (below 0: towards it) value, mm.
+             */
+            depth_mm: number;
+            /**
+             * Format: double
+             * @description Height on a wall above the camera's start, mm.
+             */
+            height_mm?: number | null;
+            /** @description Its name. */
+            id: string;
+            /** @description The job that found it. */
+            job: string;
+            /** @description `dent`, `bulge`, `step`, `hole` or `missing_material`. */
+            kind: string;
+            /**
+             * Format: double
+             * @description Extent along the travel, mm.
+             */
+            length_mm: number;
+            /**
+             * Format: int64
+             * @description Its number in the job's `defects.json`, from 1.
+             */
+            number: number;
+            /** @description The run. */
+            run: string;
+            /** @description `minor`, `moderate` or `severe`. */
+            severity: string;
+            /** @description What people decided. */
+            state: components["schemas"]["DefectState"];
+            /**
+             * Format: double
+             * @description Steepest slope, degrees.
+             */
+            steepest_slope_deg: number;
+            /**
+             * Format: int64
+             * @description Grows with every change of state or comment; 0: nobody has said anything.
+             */
+            version: number;
+            /**
+             * Format: double
+             * @description Volume, mm³.
+             */
+            volume_mm3: number;
+            /**
+             * Format: double
+             * @description Extent across the travel, mm.
+             */
+            width_mm: number;
+            /**
+             * Format: double
+             * @description World x of its middle, mm.
+             */
+            x_mm: number;
+            /**
+             * Format: double
+             * @description World y of its middle, mm; downwards.
+             */
+            y_mm: number;
+            /**
+             * Format: double
+             * @description World z of its deepest or highest place, mm.
+             */
+            z_mm: number;
+        };
+        /** @description What can be changed about a defect; absent fields stay as they are. */
+        DefectChange: {
+            /** @description Words for people, at most 4,000 characters. */
+            comment?: string | null;
+            state?: components["schemas"]["DefectState"] | null;
+            /**
+             * Format: int64
+             * @description The version that the writer has seen: where somebody else has changed the defect since, nothing is changed (409).
+             */
+            version?: number | null;
+        };
+        /** @description One defect over the runs that passed its place. */
+        DefectHistory: {
+            /** @description The defect that was asked for. */
+            defect: components["schemas"]["Defect"];
+            /** @description The runs of its asset and direction that passed its place, the one recorded last first. */
+            items: components["schemas"]["DefectSighting"][];
+        };
+        /** @description A page of defects. */
+        DefectPage: {
+            /** @description The defects. */
+            items: components["schemas"]["Defect"][];
+            /** @description Pass it as `cursor` for the next page; absent on the last. */
+            next_cursor?: string | null;
+        };
+        /** @description What one run says of a place. */
+        DefectSighting: {
+            defect?: components["schemas"]["Defect"] | null;
+            /**
+             * Format: double
+             * @description How deep a round dent of 20 mm radius had to be to be listed by that job, mm.
+             */
+            detection_limit_mm: number;
+            /** @description Its latest job that is done, or the defect's own. */
+            job: string;
+            /** @description When it was recorded. */
+            recorded_at: string;
+            /** @description The run. */
+            run: string;
+        };
+        /**
+         * @description What people decided about a defect.
+         * @enum {string}
+         */
+        DefectState: "open" | "acknowledged" | "watched" | "repaired" | "dismissed";
         /**
          * @description Which way the robot went along the asset.
          * @enum {string}
@@ -1327,6 +1694,33 @@ export interface components {
             /** @description Where to get it. */
             url: string;
         };
+        /** @description How two runs were laid on each other. */
+        Registration: {
+            /**
+             * Format: double
+             * @description Later run's x less the earlier one's at the same place, beyond what the chainages say, mm.
+             */
+            offset_x_mm: number;
+            /**
+             * Format: double
+             * @description The same for y, mm.
+             */
+            offset_y_mm: number;
+            /**
+             * Format: double
+             * @description Standard deviation of what is left along x, mm.
+             */
+            sd_x_mm: number;
+            /**
+             * Format: double
+             * @description The same along y, mm.
+             */
+            sd_y_mm: number;
+            /** @description Windows that were tried. */
+            windows: number;
+            /** @description Windows whose relief agreed. */
+            windows_agreeing: number;
+        };
         /** @description What `POST /api/runs/{run}/jobs` takes; absent fields stay as in the run's latest job. */
         Reprocess: {
             priority?: components["schemas"]["Priority"] | null;
@@ -1465,6 +1859,24 @@ export interface components {
             sha256?: string | null;
             /** @description Where to get it back, byte for byte. */
             url: string;
+        };
+        /** @description The same defect in both jobs, without a change that could be told. */
+        SameDefect: {
+            /**
+             * Format: int32
+             * @description Its number in the later job.
+             */
+            after_number: number;
+            /**
+             * Format: int32
+             * @description Its number in the earlier job.
+             */
+            before_number: number;
+            /**
+             * Format: double
+             * @description Difference of the depths, mm; below what could be told.
+             */
+            delta_depth_mm: number;
         };
         /**
          * @description A kind of thing that one may do.
@@ -2246,6 +2658,506 @@ export interface operations {
             };
         };
     };
+    list_defects: {
+        parameters: {
+            query?: {
+                /** @description Defects on this asset only. */
+                asset?: string;
+                /** @description Defects of this run only. */
+                run?: string;
+                /** @description Defects of this job only; when nothing is said, of every run's latest job that is done. */
+                job?: string;
+                /** @description `dent`, `bulge`, `step`, `hole` or `missing_material`. */
+                kind?: string;
+                /** @description `minor`, `moderate` or `severe`. */
+                severity?: string;
+                /** @description `open`, `acknowledged`, `watched`, `repaired` or `dismissed`. */
+                state?: string;
+                /** @description At this chainage or behind it, mm. */
+                from_mm?: number;
+                /** @description Before this chainage, mm. */
+                to_mm?: number;
+                /** @description At least so deep or high, mm. */
+                depth_min_mm?: number;
+                /** @description With this text in the asset's name, the comment, the kind or the code. */
+                q?: string;
+                /** @description `created`, `chainage` or `depth`, with a minus before it for the other way round; `-created` when nothing is said. */
+                sort?: string;
+                /** @description `next_cursor` of the page before. */
+                cursor?: string;
+                /** @description Most items, 1 to 1000; 50 when nothing is said. */
+                limit?: number;
+            };
+            header?: never;
+            path?: never;
+            cookie?: never;
+        };
+        requestBody?: never;
+        responses: {
+            200: {
+                headers: {
+                    [name: string]: unknown;
+                };
+                content: {
+                    "application/json": components["schemas"]["DefectPage"];
+                };
+            };
+            400: {
+                headers: {
+                    [name: string]: unknown;
+                };
+                content: {
+                    "application/problem+json": components["schemas"]["Problem"];
+                };
+            };
+            /** @description Nobody that this server knows */
+            401: {
+                headers: {
+                    [name: string]: unknown;
+                };
+                content: {
+                    "application/problem+json": components["schemas"]["Problem"];
+                };
+            };
+            /** @description The token may not do this, or the request comes from a foreign page */
+            403: {
+                headers: {
+                    [name: string]: unknown;
+                };
+                content: {
+                    "application/problem+json": components["schemas"]["Problem"];
+                };
+            };
+            /** @description Too many requests; `Retry-After` says when to come back */
+            429: {
+                headers: {
+                    [name: string]: unknown;
+                };
+                content: {
+                    "application/problem+json": components["schemas"]["Problem"];
+                };
+            };
+            /** @description The records or files do not answer, or all places are taken; come back in a moment */
+            503: {
+                headers: {
+                    [name: string]: unknown;
+                };
+                content: {
+                    "application/problem+json": components["schemas"]["Problem"];
+                };
+            };
+        };
+    };
+    get_csv: {
+        parameters: {
+            query?: {
+                /** @description Defects on this asset only. */
+                asset?: string;
+                /** @description Defects of this run only. */
+                run?: string;
+                /** @description Defects of this job only; when nothing is said, of every run's latest job that is done. */
+                job?: string;
+                /** @description `dent`, `bulge`, `step`, `hole` or `missing_material`. */
+                kind?: string;
+                /** @description `minor`, `moderate` or `severe`. */
+                severity?: string;
+                /** @description `open`, `acknowledged`, `watched`, `repaired` or `dismissed`. */
+                state?: string;
+                /** @description At this chainage or behind it, mm. */
+                from_mm?: number;
+                /** @description Before this chainage, mm. */
+                to_mm?: number;
+                /** @description At least so deep or high, mm. */
+                depth_min_mm?: number;
+                /** @description With this text in the asset's name, the comment, the kind or the code. */
+                q?: string;
+                /** @description `created`, `chainage` or `depth`, with a minus before it for the other way round; `-created` when nothing is said. */
+                sort?: string;
+                /** @description `next_cursor` of the page before. */
+                cursor?: string;
+                /** @description Most items, 1 to 1000; 50 when nothing is said. */
+                limit?: number;
+            };
+            header?: never;
+            path?: never;
+            cookie?: never;
+        };
+        requestBody?: never;
+        responses: {
+            200: {
+                headers: {
+                    [name: string]: unknown;
+                };
+                content: {
+                    "text/csv": string;
+                };
+            };
+            400: {
+                headers: {
+                    [name: string]: unknown;
+                };
+                content: {
+                    "application/problem+json": components["schemas"]["Problem"];
+                };
+            };
+            /** @description Nobody that this server knows */
+            401: {
+                headers: {
+                    [name: string]: unknown;
+                };
+                content: {
+                    "application/problem+json": components["schemas"]["Problem"];
+                };
+            };
+            /** @description The token may not do this, or the request comes from a foreign page */
+            403: {
+                headers: {
+                    [name: string]: unknown;
+                };
+                content: {
+                    "application/problem+json": components["schemas"]["Problem"];
+                };
+            };
+            /** @description Too many requests; `Retry-After` says when to come back */
+            429: {
+                headers: {
+                    [name: string]: unknown;
+                };
+                content: {
+                    "application/problem+json": components["schemas"]["Problem"];
+                };
+            };
+            /** @description The records or files do not answer, or all places are taken; come back in a moment */
+            503: {
+                headers: {
+                    [name: string]: unknown;
+                };
+                content: {
+                    "application/problem+json": components["schemas"]["Problem"];
+                };
+            };
+        };
+    };
+    get_geojson: {
+        parameters: {
+            query?: {
+                /** @description Defects on this asset only. */
+                asset?: string;
+                /** @description Defects of this run only. */
+                run?: string;
+                /** @description Defects of this job only; when nothing is said, of every run's latest job that is done. */
+                job?: string;
+                /** @description `dent`, `bulge`, `step`, `hole` or `missing_material`. */
+                kind?: string;
+                /** @description `minor`, `moderate` or `severe`. */
+                severity?: string;
+                /** @description `open`, `acknowledged`, `watched`, `repaired` or `dismissed`. */
+                state?: string;
+                /** @description At this chainage or behind it, mm. */
+                from_mm?: number;
+                /** @description Before this chainage, mm. */
+                to_mm?: number;
+                /** @description At least so deep or high, mm. */
+                depth_min_mm?: number;
+                /** @description With this text in the asset's name, the comment, the kind or the code. */
+                q?: string;
+                /** @description `created`, `chainage` or `depth`, with a minus before it for the other way round; `-created` when nothing is said. */
+                sort?: string;
+                /** @description `next_cursor` of the page before. */
+                cursor?: string;
+                /** @description Most items, 1 to 1000; 50 when nothing is said. */
+                limit?: number;
+            };
+            header?: never;
+            path?: never;
+            cookie?: never;
+        };
+        requestBody?: never;
+        responses: {
+            200: {
+                headers: {
+                    [name: string]: unknown;
+                };
+                content: {
+                    "application/geo+json": Record<string, never>;
+                };
+            };
+            400: {
+                headers: {
+                    [name: string]: unknown;
+                };
+                content: {
+                    "application/problem+json": components["schemas"]["Problem"];
+                };
+            };
+            /** @description Nobody that this server knows */
+            401: {
+                headers: {
+                    [name: string]: unknown;
+                };
+                content: {
+                    "application/problem+json": components["schemas"]["Problem"];
+                };
+            };
+            /** @description The token may not do this, or the request comes from a foreign page */
+            403: {
+                headers: {
+                    [name: string]: unknown;
+                };
+                content: {
+                    "application/problem+json": components["schemas"]["Problem"];
+                };
+            };
+            /** @description Too many requests; `Retry-After` says when to come back */
+            429: {
+                headers: {
+                    [name: string]: unknown;
+                };
+                content: {
+                    "application/problem+json": components["schemas"]["Problem"];
+                };
+            };
+            /** @description The records or files do not answer, or all places are taken; come back in a moment */
+            503: {
+                headers: {
+                    [name: string]: unknown;
+                };
+                content: {
+                    "application/problem+json": components["schemas"]["Problem"];
+                };
+            };
+        };
+    };
+    get_defect: {
+        parameters: {
+            query?: never;
+            header?: never;
+            path: {
+                /** @description The defect */
+                defect: string;
+            };
+            cookie?: never;
+        };
+        requestBody?: never;
+        responses: {
+            200: {
+                headers: {
+                    [name: string]: unknown;
+                };
+                content: {
+                    "application/json": components["schemas"]["Defect"];
+                };
+            };
+            /** @description Nobody that this server knows */
+            401: {
+                headers: {
+                    [name: string]: unknown;
+                };
+                content: {
+                    "application/problem+json": components["schemas"]["Problem"];
+                };
+            };
+            /** @description The token may not do this, or the request comes from a foreign page */
+            403: {
+                headers: {
+                    [name: string]: unknown;
+                };
+                content: {
+                    "application/problem+json": components["schemas"]["Problem"];
+                };
+            };
+            404: {
+                headers: {
+                    [name: string]: unknown;
+                };
+                content: {
+                    "application/problem+json": components["schemas"]["Problem"];
+                };
+            };
+            /** @description Too many requests; `Retry-After` says when to come back */
+            429: {
+                headers: {
+                    [name: string]: unknown;
+                };
+                content: {
+                    "application/problem+json": components["schemas"]["Problem"];
+                };
+            };
+            /** @description The records or files do not answer, or all places are taken; come back in a moment */
+            503: {
+                headers: {
+                    [name: string]: unknown;
+                };
+                content: {
+                    "application/problem+json": components["schemas"]["Problem"];
+                };
+            };
+        };
+    };
+    change_defect: {
+        parameters: {
+            query?: never;
+            header?: never;
+            path: {
+                /** @description The defect */
+                defect: string;
+            };
+            cookie?: never;
+        };
+        requestBody: {
+            content: {
+                "application/json": components["schemas"]["DefectChange"];
+            };
+        };
+        responses: {
+            200: {
+                headers: {
+                    [name: string]: unknown;
+                };
+                content: {
+                    "application/json": components["schemas"]["Defect"];
+                };
+            };
+            400: {
+                headers: {
+                    [name: string]: unknown;
+                };
+                content: {
+                    "application/problem+json": components["schemas"]["Problem"];
+                };
+            };
+            /** @description Nobody that this server knows */
+            401: {
+                headers: {
+                    [name: string]: unknown;
+                };
+                content: {
+                    "application/problem+json": components["schemas"]["Problem"];
+                };
+            };
+            /** @description The token may not do this, or the request comes from a foreign page */
+            403: {
+                headers: {
+                    [name: string]: unknown;
+                };
+                content: {
+                    "application/problem+json": components["schemas"]["Problem"];
+                };
+            };
+            404: {
+                headers: {
+                    [name: string]: unknown;
+                };
+                content: {
+                    "application/problem+json": components["schemas"]["Problem"];
+                };
+            };
+            /** @description Somebody else has changed it since that version */
+            409: {
+                headers: {
+                    [name: string]: unknown;
+                };
+                content: {
+                    "application/problem+json": components["schemas"]["Problem"];
+                };
+            };
+            /** @description Too many requests; `Retry-After` says when to come back */
+            429: {
+                headers: {
+                    [name: string]: unknown;
+                };
+                content: {
+                    "application/problem+json": components["schemas"]["Problem"];
+                };
+            };
+            /** @description The records or files do not answer, or all places are taken; come back in a moment */
+            503: {
+                headers: {
+                    [name: string]: unknown;
+                };
+                content: {
+                    "application/problem+json": components["schemas"]["Problem"];
+                };
+            };
+        };
+    };
+    get_history: {
+        parameters: {
+            query?: {
+                /** @description How far runs may lie shifted to each other, mm; 100 when nothing is said. */
+                slack_mm?: number;
+            };
+            header?: never;
+            path: {
+                /** @description The defect */
+                defect: string;
+            };
+            cookie?: never;
+        };
+        requestBody?: never;
+        responses: {
+            200: {
+                headers: {
+                    [name: string]: unknown;
+                };
+                content: {
+                    "application/json": components["schemas"]["DefectHistory"];
+                };
+            };
+            400: {
+                headers: {
+                    [name: string]: unknown;
+                };
+                content: {
+                    "application/problem+json": components["schemas"]["Problem"];
+                };
+            };
+            /** @description Nobody that this server knows */
+            401: {
+                headers: {
+                    [name: string]: unknown;
+                };
+                content: {
+                    "application/problem+json": components["schemas"]["Problem"];
+                };
+            };
+            /** @description The token may not do this, or the request comes from a foreign page */
+            403: {
+                headers: {
+                    [name: string]: unknown;
+                };
+                content: {
+                    "application/problem+json": components["schemas"]["Problem"];
+                };
+            };
+            404: {
+                headers: {
+                    [name: string]: unknown;
+                };
+                content: {
+                    "application/problem+json": components["schemas"]["Problem"];
+                };
+            };
+            /** @description Too many requests; `Retry-After` says when to come back */
+            429: {
+                headers: {
+                    [name: string]: unknown;
+                };
+                content: {
+                    "application/problem+json": components["schemas"]["Problem"];
+                };
+            };
+            /** @description The records or files do not answer, or all places are taken; come back in a moment */
+            503: {
+                headers: {
+                    [name: string]: unknown;
+                };
+                content: {
+                    "application/problem+json": components["schemas"]["Problem"];
+                };
+            };
+        };
+    };
     list_jobs: {
         parameters: {
             query?: {
@@ -2535,6 +3447,90 @@ export interface operations {
                 };
             };
             409: {
+                headers: {
+                    [name: string]: unknown;
+                };
+                content: {
+                    "application/problem+json": components["schemas"]["Problem"];
+                };
+            };
+            /** @description Too many requests; `Retry-After` says when to come back */
+            429: {
+                headers: {
+                    [name: string]: unknown;
+                };
+                content: {
+                    "application/problem+json": components["schemas"]["Problem"];
+                };
+            };
+            /** @description The records or files do not answer, or all places are taken; come back in a moment */
+            503: {
+                headers: {
+                    [name: string]: unknown;
+                };
+                content: {
+                    "application/problem+json": components["schemas"]["Problem"];
+                };
+            };
+        };
+    };
+    get_change: {
+        parameters: {
+            query: {
+                /** @description The earlier job, of the same asset. */
+                before: string;
+            };
+            header?: never;
+            path: {
+                /** @description The later job */
+                job: string;
+            };
+            cookie?: never;
+        };
+        requestBody?: never;
+        responses: {
+            200: {
+                headers: {
+                    [name: string]: unknown;
+                };
+                content: {
+                    "application/json": components["schemas"]["ChangeReport"];
+                };
+            };
+            /** @description It is being worked out; `Retry-After` says when to come back */
+            202: {
+                headers: {
+                    [name: string]: unknown;
+                };
+                content?: never;
+            };
+            400: {
+                headers: {
+                    [name: string]: unknown;
+                };
+                content: {
+                    "application/problem+json": components["schemas"]["Problem"];
+                };
+            };
+            /** @description Nobody that this server knows */
+            401: {
+                headers: {
+                    [name: string]: unknown;
+                };
+                content: {
+                    "application/problem+json": components["schemas"]["Problem"];
+                };
+            };
+            /** @description The token may not do this, or the request comes from a foreign page */
+            403: {
+                headers: {
+                    [name: string]: unknown;
+                };
+                content: {
+                    "application/problem+json": components["schemas"]["Problem"];
+                };
+            };
+            404: {
                 headers: {
                     [name: string]: unknown;
                 };

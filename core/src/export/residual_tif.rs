@@ -3,7 +3,7 @@
 
 use std::collections::VecDeque;
 use std::fs::File;
-use std::io::BufReader;
+use std::io::{BufReader, Read, Seek};
 use std::path::{Path, PathBuf};
 
 use tiff::decoder::{Decoder, DecodingResult, Limits};
@@ -72,9 +72,12 @@ impl ResidualWriter {
 }
 
 /// A `residual.tif` for reading, tile by tile.
-pub struct ResidualFile {
+pub struct ResidualFile<R = BufReader<File>>
+where
+    R: Read + Seek,
+{
     path: PathBuf,
-    decoder: Decoder<BufReader<File>>,
+    decoder: Decoder<R>,
     geometry: MapGeometry,
     side_px: usize,
     /// The tiles read last, with their numbers.
@@ -88,8 +91,18 @@ impl ResidualFile {
     /// One that is not there, or no residual map of stria.
     pub fn open(path: &Path) -> Result<ResidualFile> {
         let file = File::open(path).map_err(|e| Error::io(path, e))?;
+        ResidualFile::read(BufReader::new(file), path)
+    }
+}
+
+impl<R: Read + Seek> ResidualFile<R> {
+    /// Reads a file that lies anywhere; `path` names it in errors.
+    ///
+    /// # Errors
+    /// What is no residual map of stria.
+    pub fn read(file: R, path: &Path) -> Result<ResidualFile<R>> {
         let wrong = |e: tiff::TiffError| refused(path, &e.to_string());
-        let mut decoder = Decoder::new(BufReader::new(file)).map_err(wrong)?.with_limits(Limits::default());
+        let mut decoder = Decoder::new(file).map_err(wrong)?.with_limits(Limits::default());
         let (width, height) = decoder.dimensions().map_err(wrong)?;
         let matrix = decoder.get_tag_f64_vec(Tag::ModelTransformationTag).map_err(wrong)?;
         let (side_px, other_px) = decoder.chunk_dimensions();
@@ -134,7 +147,7 @@ fn refused(path: &Path, found: &str) -> Error {
     Error::input(path.display().to_string(), found, "a residual.tif of stria")
 }
 
-impl MapReader for ResidualFile {
+impl<R: Read + Seek> MapReader for ResidualFile<R> {
     fn geometry(&self) -> MapGeometry {
         self.geometry
     }

@@ -88,7 +88,7 @@ impl Site {
 
     async fn finish(&self, lease: &Lease) {
         let quality = serde_json::json!({"coverage": 0.75, "frames": 10, "residual_px": 0.1});
-        let outcome = Outcome { products: vec![], warnings: vec![], quality, frames: 10 };
+        let outcome = Outcome { products: vec![], warnings: vec![], quality, frames: 10, defects: None };
         self.queue.finish(lease, outcome).await.expect("publishes");
     }
 }

@@ -17,8 +17,9 @@ use super::{Failed, Outcome, Success};
 use crate::auth::{Auth, Scopes};
 use crate::batches::Batches;
 use crate::config::{Config, Doors, GB, LiveLimits, RequestLimits, UploadLimits};
+use crate::defects::Defects;
 use crate::error::Error;
-use crate::http::{self, App, Rates};
+use crate::http::{self, App, Changes, Rates};
 use crate::live::Live;
 use crate::retention::Policy;
 use crate::runs::Runs;
@@ -185,6 +186,8 @@ async fn serve(config: Config) -> std::result::Result<(), Failed> {
         streams: Arc::new(Semaphore::new(config.live.streams_at_once)),
         queue: queue.clone(),
         batches: batches.clone(),
+        defects: Defects::new(db.clone()),
+        changes: Changes::default(),
         store: store.clone(),
         arrivals: Arc::new(Semaphore::new(config.requests.uploads_at_once)),
         config: Arc::new(config.clone()),

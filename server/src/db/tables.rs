@@ -513,3 +513,71 @@ pub mod pin {
 
     impl ActiveModelBehavior for ActiveModel {}
 }
+
+/// Defects of jobs that are done.
+pub mod defect {
+    use sea_orm::entity::prelude::*;
+
+    #[derive(Clone, Debug, PartialEq, DeriveEntityModel, serde::Serialize, serde::Deserialize)]
+    #[sea_orm(table_name = "defects")]
+    pub struct Model {
+        #[sea_orm(primary_key, auto_increment = false)]
+        pub id: String,
+        pub job_id: String,
+        pub run_id: String,
+        pub asset: String,
+        pub is_current: i32,
+        pub number: i64,
+        pub kind: String,
+        pub severity: String,
+        pub code: Option<String>,
+        pub chainage_mm: f64,
+        pub clock_h: Option<f64>,
+        pub height_mm: Option<f64>,
+        pub x_mm: f64,
+        pub y_mm: f64,
+        pub z_mm: f64,
+        pub depth_mm: f64,
+        pub size_mm: f64,
+        pub length_mm: f64,
+        pub width_mm: f64,
+        pub area_mm2: f64,
+        pub volume_mm3: f64,
+        pub steepest_slope_deg: f64,
+        pub confidence: f64,
+        pub at_edge: i32,
+        pub state: String,
+        pub comment: String,
+        pub version: i64,
+        pub changed_ms: Option<i64>,
+        pub changed_by: Option<String>,
+        pub carried_from: Option<String>,
+    }
+
+    #[derive(Copy, Clone, Debug, EnumIter, DeriveRelation)]
+    pub enum Relation {}
+
+    impl ActiveModelBehavior for ActiveModel {}
+}
+
+/// What jobs that are done have looked at.
+pub mod inspection {
+    use sea_orm::entity::prelude::*;
+
+    #[derive(Clone, Debug, PartialEq, DeriveEntityModel, serde::Serialize, serde::Deserialize)]
+    #[sea_orm(table_name = "inspections")]
+    pub struct Model {
+        #[sea_orm(primary_key, auto_increment = false)]
+        pub job_id: String,
+        pub x_min_mm: f64,
+        pub x_max_mm: f64,
+        pub detection_limit_mm: f64,
+        pub doubtful: i64,
+        pub omitted: i64,
+    }
+
+    #[derive(Copy, Clone, Debug, EnumIter, DeriveRelation)]
+    pub enum Relation {}
+
+    impl ActiveModelBehavior for ActiveModel {}
+}

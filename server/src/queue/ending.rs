@@ -4,6 +4,7 @@ use std::sync::atomic::{AtomicBool, Ordering};
 
 use sea_orm::sea_query::Expr;
 use sea_orm::{ActiveValue::Set, ColumnTrait, ConnectionTrait, EntityTrait, PaginatorTrait, QueryFilter, QuerySelect};
+use stria_core::defects::DefectList;
 use uuid::Uuid;
 
 use super::lease::{Lease, add_log_line, lease_holds, must_hold, to_i64};
@@ -11,6 +12,7 @@ use super::{Queue, mark_unpublished, repeat_in_run};
 use crate::config::JobLimits;
 use crate::db::retried;
 use crate::db::tables::{job, product, run, segment, unpublished};
+use crate::defects;
 use crate::error::{Error, Result};
 use crate::store::{self, Facts, ProductName};
 use crate::wire::child::Failure;
@@ -40,6 +42,8 @@ pub struct Outcome {
     pub quality: serde_json::Value,
     /// Frames read.
     pub frames: u64,
+    /// The defects, where they were looked for.
+    pub defects: Option<DefectList>,
 }
 
 impl Queue {
@@ -108,6 +112,9 @@ impl Queue {
                 .filter(run::Column::LatestJob.lt(lease.job.as_str()))
                 .exec(&*t)
                 .await?;
+        }
+        if let Some(words) = defects::publish(&*t, &lease.run, &lease.job, outcome.defects.as_ref()).await? {
+            add_log_line(&*t, &lease.job, lease.attempt, &words, &self.limits).await?;
         }
         repeat_in_run(&*t, &lease.job, JobState::Done).await?;
         t.commit().await?;

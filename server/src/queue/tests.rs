@@ -80,7 +80,7 @@ pub(super) fn outcome() -> Outcome {
     let facts = Facts { bytes: 3, sha256: "00".into() };
     let name = ProductName::new("depth.tif").expect("plain");
     let products = vec![PublishedProduct { name, facts }];
-    Outcome { products, warnings: vec!["dusty".into()], quality: serde_json::json!({}), frames: 7 }
+    Outcome { products, warnings: vec!["dusty".into()], quality: serde_json::json!({}), frames: 7, defects: None }
 }
 
 fn fast() -> JobLimits {

@@ -29,6 +29,11 @@ impl Runs {
         found.ok_or_else(|| Error::NotFound { what: "job", id: id.into() })
     }
 
+    /// A job's recipe, whole.
+    pub async fn recipe_toml(&self, id: &str) -> Result<String> {
+        Ok(self.job_row(id).await?.recipe_toml)
+    }
+
     /// The products of a job, in the manifest's order; none until it is done.
     pub async fn products(&self, job: &str, page: &Page) -> Result<wire::ProductPage> {
         self.job_row(job).await?;

@@ -169,16 +169,8 @@ impl RunFilter {
             all = all.add(run::Column::LatestJob.in_subquery(with_it));
         }
         if let Some(q) = self.q.as_ref().filter(|q| !q.is_empty()) {
-            // PostgreSQL's LIKE tells capitals from small letters, SQLite's only outside ASCII, as does its `lower`.
             let columns = [run::Column::Asset, run::Column::Filename, run::Column::Note, run::Column::RigName];
-            let mut any = Condition::any();
-            for text in [q.to_lowercase(), q.to_ascii_lowercase()] {
-                let like = sea_query::LikeExpr::new(format!("%{}%", escaped(&text))).escape('\\');
-                for column in columns {
-                    any = any.add(Expr::expr(Func::lower(Expr::col(column))).like(like.clone()));
-                }
-            }
-            all = all.add(any);
+            all = all.add(with_words(q, &columns));
         }
         if let Some(from) = &self.from {
             all = all.add(run::Column::RecordedMs.gte(read_time("from", from)?));
@@ -188,6 +180,19 @@ impl RunFilter {
         }
         Ok(all)
     }
+}
+
+/// Rows with a text in one of these columns, in capitals or small letters.
+pub fn with_words<C: ColumnTrait>(q: &str, columns: &[C]) -> Condition {
+    // PostgreSQL's LIKE tells capitals from small letters, SQLite's only outside ASCII, as does its `lower`.
+    let mut any = Condition::any();
+    for text in [q.to_lowercase(), q.to_ascii_lowercase()] {
+        let like = sea_query::LikeExpr::new(format!("%{}%", escaped(&text))).escape('\\');
+        for column in columns {
+            any = any.add(Expr::expr(Func::lower(Expr::col(*column))).like(like.clone()));
+        }
+    }
+    any
 }
 
 /// LIKE's wildcards mean themselves.

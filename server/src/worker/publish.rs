@@ -1,8 +1,10 @@
 //! What a child made → the store, checked; the records follow in one transaction (`Queue::finish`).
 
-use std::path::{Component, Path};
+use std::path::{Component, Path, PathBuf};
 
 use futures::stream::{StreamExt, TryStreamExt};
+use stria_core::defects::DefectList;
+use stria_core::export::defect_list;
 use stria_core::export::manifest::{FileEntry, Manifest};
 
 use super::Worker;
@@ -14,6 +16,9 @@ use crate::store::{Facts, Key, ProductName, facts_of};
 
 /// Products on their way into the store at the same time: to S3, waiting costs more than sending.
 const FILES_AT_ONCE: usize = 8;
+
+/// A list of defects larger than this is none of ours: a hundred thousand take a tenth of it.
+const MAX_LIST_BYTES: u64 = 512 * 1024 * 1024;
 
 /// The list of the products is a product itself, and the only one that cannot list its own hash.
 const MANIFEST: &str = "manifest.json";
@@ -32,6 +37,7 @@ pub(super) async fn store(worker: &Worker, lease: &Lease, scratch: &Scratch, man
     }
     // A person looks for the files first; the tiles are for programs.
     products.sort_by_key(|p| p.name.as_str().contains('/'));
+    let defects = defects(&products, &out).await?;
     // As a list: the compiler cannot tell that a closure's futures may go from thread to thread.
     let into_store: Vec<_> = products.iter().map(|product| put(worker, lease, &out, product)).collect();
     futures::stream::iter(into_store).buffer_unordered(FILES_AT_ONCE).try_collect::<()>().await?;
@@ -41,7 +47,21 @@ pub(super) async fn store(worker: &Worker, lease: &Lease, scratch: &Scratch, man
     }
     metrics().frames.inc_by(manifest.quality.frames);
     let quality = serde_json::to_value(&manifest.quality).map_err(|e| Error::Internal(format!("quality: {e}")))?;
-    Ok(Outcome { products, warnings: manifest.warnings, quality, frames: manifest.quality.frames })
+    Ok(Outcome { products, warnings: manifest.warnings, quality, frames: manifest.quality.frames, defects })
+}
+
+/// The list of defects, where there is one: read before it goes into the store.
+async fn defects(products: &[PublishedProduct], out: &Path) -> Result<Option<DefectList>> {
+    let Some(listed) = products.iter().find(|p| p.name.as_str() == defect_list::JSON_NAME) else { return Ok(None) };
+    if listed.facts.bytes > MAX_LIST_BYTES {
+        let found = format!("{} has {} bytes", defect_list::JSON_NAME, listed.facts.bytes);
+        return Err(Error::Internal(format!("{found}; at most {MAX_LIST_BYTES} are read")));
+    }
+    check_plain_file(out, &out.join(defect_list::JSON_NAME), listed.facts.bytes).await?;
+    let folder: PathBuf = out.into();
+    let read = tokio::task::spawn_blocking(move || defect_list::load(&folder)).await;
+    let read = read.map_err(|e| Error::Internal(format!("reading the list of defects stopped: {e}")))?;
+    read.map(Some).map_err(|e| Error::Internal(format!("the child's list of defects: {e}")))
 }
 
 /// Checks a product and puts it into the store.
