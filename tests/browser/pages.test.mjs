@@ -3,13 +3,9 @@
 import assert from "node:assert/strict";
 import { gzipSync } from "node:zlib";
 import { after, before, test } from "node:test";
-import { getJson, jobEnds, keepPicture, mapSettled, measuredRun, openPage, seriousViolations, sendRun, simulate, startBrowser, startServer, until } from "./support.mjs";
+import { getJson, jobEnds, mapSettled, measuredRun, openPage, sendRun, simulate, startBrowser, startServer, until } from "./support.mjs";
+import { lookAround } from "./looks.mjs";
 
-const SIZES = [
-  { width: 1440, height: 900 },
-  { width: 768, height: 1024 },
-  { width: 360, height: 740 },
-];
 const FIRST_PAGE_BYTES = 200_000;
 let server, empty, browser, run, other, first, second, batch;
 
@@ -129,22 +125,4 @@ test("times are local and carry UTC", async () => {
   await close();
 });
 
-/** Looks at a page in all sizes and schemes: keeps a picture, checks what a program can check. It is loaded once and then changes, as when a tablet is turned. */
-async function everyLook(at, name, address, ready) {
-  const { page, close } = await openPage(browser, at, { viewport: SIZES[0] });
-  await page.goto(address);
-  await ready(page);
-  for (const colorScheme of ["light", "dark"]) {
-    for (const viewport of SIZES) {
-      const look = `${name}-${viewport.width}-${colorScheme}`;
-      await page.emulateMedia({ colorScheme });
-      await page.setViewportSize(viewport);
-      for (const map of await page.locator(".map-panel").all()) await mapSettled(page, map);
-      await until("pictures are loaded", 10_000, () => page.evaluate(() => [...document.images].every((image) => image.complete || image.loading === "lazy")));
-      await keepPicture(page, look);
-      assert.equal(await page.evaluate(() => document.documentElement.scrollWidth - innerWidth), 0, `${look}: nothing sticks out to the side`);
-      assert.deepEqual(await seriousViolations(page), [], look);
-    }
-  }
-  await close();
-}
+const everyLook = (at, name, address, ready) => lookAround(browser, at, name, address, ready);

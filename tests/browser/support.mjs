@@ -58,11 +58,11 @@ export async function startServer(flags = [], { locked = false } = {}) {
 }
 
 /** Makes a realistic run in a new folder: its video, its rig. `remove` takes the folder away. */
-export async function simulate({ scene = "pipe", seconds = 2, size = "640x360", seed = 1 } = {}) {
+export async function simulate({ scene = "pipe", seconds = 2, size = "640x360", seed = 1, more = [] } = {}) {
   need(stria, "run `make build`, or set STRIA_BIN");
   const folder = await mkdtemp(path.join(tmpdir(), "stria-run-"));
   const out = path.join(folder, "run");
-  await promisify(execFile)(stria, ["simulate", scene, "--out", out, "--seconds", `${seconds}`, "--size", size, "--seed", `${seed}`]);
+  await promisify(execFile)(stria, ["simulate", scene, "--out", out, "--seconds", `${seconds}`, "--size", size, "--seed", `${seed}`, ...more]);
   return {
     folder,
     video: path.join(out, "video.mp4"),

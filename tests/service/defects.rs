@@ -202,7 +202,8 @@ fn two_runs_of_an_asset_show_what_changed_and_one_defect_over_time() {
     let problem = problem_of(send(ask(&job(&elsewhere), &job(&first))), 400);
     assert_eq!(problem["field"], "before", "{problem}");
     problem_of(send(ask(&job(&second), "none")), 404);
-    problem_of(send(server.get(&format!("/api/jobs/{}/change", job(&second)))), 400);
+    let problem = problem_of(send(server.get(&format!("/api/jobs/{}/change", job(&second)))), 400);
+    assert_eq!(problem["field"], "before", "{problem}");
     let turned = server.patch(&format!("/api/runs/{}", text(&second, "/id"))).json(&json!({"direction": "backward"}));
     json_of(send(turned), 200);
     let problem = problem_of(send(ask(&job(&second), &job(&first))), 400);

@@ -33,6 +33,13 @@ export type Batch = Schemas["Batch"];
 export type BatchWish = Schemas["BatchWish"];
 export type BatchResult = Schemas["BatchResult"];
 export type BatchResultPage = Schemas["BatchResultPage"];
+export type Defect = Schemas["Defect"];
+export type DefectPage = Schemas["DefectPage"];
+export type DefectState = Schemas["DefectState"];
+export type DefectChange = Schemas["DefectChange"];
+export type DefectHistory = Schemas["DefectHistory"];
+export type ChangeReport = Schemas["ChangeReport"];
+export type Change = Schemas["Change"];
 
 /** What we read of a job's `manifest.json`. A file of the product folder, not a shape of the HTTP interface. */
 export interface Manifest {
@@ -148,6 +155,70 @@ export function listRuns(filter: RunFilter, cursor: string | null, limit: number
   for (const [name, value] of Object.entries(filter)) if (value !== "") query.set(name, value as string);
   if (cursor !== null) query.set("cursor", cursor);
   return json(`/api/runs?${query}`, signal ? { signal } : undefined);
+}
+
+/** Which defects to list, in which order; what is empty does not matter. */
+export interface DefectFilter {
+  q: string;
+  asset: string;
+  kind: string;
+  severity: string;
+  state: string;
+  from_mm: string;
+  to_mm: string;
+  depth_min_mm: string;
+  sort: string;
+}
+
+function defectQuery(filter: Partial<DefectFilter> & { job?: string }): URLSearchParams {
+  const query = new URLSearchParams();
+  for (const [name, value] of Object.entries(filter)) if (value !== undefined && value !== "") query.set(name, value);
+  return query;
+}
+
+/** A page of defects; `cursor` is null for the first. */
+export function listDefects(filter: Partial<DefectFilter> & { job?: string }, cursor: string | null, limit: number, signal?: AbortSignal): Promise<DefectPage> {
+  const query = defectQuery(filter);
+  query.set("limit", `${limit}`);
+  if (cursor !== null) query.set("cursor", cursor);
+  return json(`/api/defects?${query}`, signal ? { signal } : undefined);
+}
+
+/** The address of the same list as a file. */
+export const defectsFile = (format: "csv" | "geojson", filter: Partial<DefectFilter>): string => `/api/defects.${format}?${defectQuery(filter)}`;
+export const getDefect = (defect: string): Promise<Defect> => json(`/api/defects/${at(defect)}`);
+export const getDefectHistory = (defect: string): Promise<DefectHistory> => json(`/api/defects/${at(defect)}/history`);
+export const changeDefect = (defect: string, change: DefectChange): Promise<Defect> =>
+  json(`/api/defects/${at(defect)}`, { method: "PATCH", headers: { "content-type": "application/json" }, body: JSON.stringify(change) });
+
+/** What changed between two jobs; null while the server works it out. */
+export async function getChange(before: string, after: string): Promise<ChangeReport | null> {
+  const response = await request(`/api/jobs/${at(after)}/change?before=${at(before)}`);
+  return response.status === 202 ? null : ((await response.json()) as ChangeReport);
+}
+
+/** What we read of a job's `defects.json`: what it could have seen. */
+export interface DefectListFile {
+  detection_limit_mm: number;
+  doubtful: number;
+  omitted: number;
+}
+
+/** A job's own list of defects; null where it was not searched for any. */
+export async function getDefectList(job: string): Promise<DefectListFile | null> {
+  try {
+    return await json<DefectListFile>(productPath(job, "defects.json"));
+  } catch (error) {
+    if (error instanceof ApiError && error.problem.status === 404) return null;
+    throw error;
+  }
+}
+
+/** `sections.csv` of a job, column by column; null where a place has no value. */
+export async function getSections(job: string): Promise<Map<string, (number | null)[]>> {
+  const text = await (await request(productPath(job, "sections.csv"))).text();
+  const [head, ...lines] = text.trim().split("\n").map((line) => line.split(","));
+  return new Map((head ?? []).map((name, column) => [name, lines.map((line) => (line[column] ? Number(line[column]) : null))]));
 }
 
 /** All pages of a list that is not long. */

@@ -19,6 +19,7 @@ const SendView = lazy(async () => (await import("./views/send.tsx")).SendView);
 const LiveView = lazy(async () => (await import("./views/live.tsx")).LiveView);
 const QueueView = lazy(async () => (await import("./views/queue.tsx")).QueueView);
 const BatchView = lazy(async () => (await import("./views/batch.tsx")).BatchView);
+const DefectsView = lazy(async () => (await import("./views/defects.tsx")).DefectsView);
 const SettingsView = lazy(async () => (await import("./views/settings.tsx")).SettingsView);
 
 /** What changes when another view begins: then the reading starts at its top. */
@@ -59,6 +60,9 @@ function App() {
             <Link to="/" current={route.view === "runs" || route.view === "run" || route.view === "compare"}>
               {texts.nav.runs}
             </Link>
+            <Link to="/defects" current={route.view === "defects"}>
+              {texts.nav.defects}
+            </Link>
             <Link to="/live" current={route.view === "live"}>
               {texts.nav.live}
             </Link>
@@ -97,6 +101,8 @@ function View({ route }: { route: Route }) {
       return <QueueView />;
     case "batch":
       return <BatchView key={route.batch} batch={route.batch} />;
+    case "defects":
+      return <DefectsView />;
     case "settings":
       return <SettingsView section={route.section} />;
     case "unknown":

@@ -2,6 +2,7 @@
 
 import type { ComponentChildren, JSX } from "preact";
 import { useEffect, useState } from "preact/hooks";
+import type { Defect } from "./api.ts";
 
 /** What a path stands for. */
 export type Route =
@@ -10,6 +11,7 @@ export type Route =
   | { view: "live" }
   | { view: "queue" }
   | { view: "batch"; batch: string }
+  | { view: "defects" }
   | { view: "settings"; section: string }
   | { view: "run"; run: string; job: string | null; tab: string | null }
   | { view: "compare"; run: string; left: string | null; right: string | null }
@@ -21,6 +23,7 @@ const PLAIN: Record<string, Route> = {
   "/send": { view: "send" },
   "/live": { view: "live" },
   "/queue": { view: "queue" },
+  "/defects": { view: "defects" },
   "/settings": { view: "settings", section: "rigs" },
 };
 
@@ -52,7 +55,16 @@ export function runPath(run: string, job: string | null = null, tab: string | nu
 /** The path of a batch's page. */
 export const batchPath = (batch: string): string => `/batches/${encodeURIComponent(batch)}`;
 
-/** Two jobs of a run side by side. */
+/** A run's defects with one of them in the middle of the map. */
+export function defectPath({ run, job, current, number, x_mm, y_mm, length_mm, width_mm }: Defect): string {
+  const query = new URLSearchParams({ tab: "defects", no: `${number}` });
+  if (!current) query.set("job", job);
+  // So close that it takes about a third of the map.
+  query.set("at", `${x_mm.toFixed(1)},${y_mm.toFixed(1)},${Math.max(length_mm, width_mm, 20) / 150}`);
+  return `/runs/${encodeURIComponent(run)}?${query.toString().replaceAll("%2C", ",")}`;
+}
+
+/** Two jobs side by side: of one run, or of two runs of one asset. */
 export function comparePath(run: string, left: string, right: string): string {
   return `/runs/${encodeURIComponent(run)}/compare?${new URLSearchParams({ left, right })}`;
 }

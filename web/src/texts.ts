@@ -14,7 +14,7 @@ export const texts = {
   menu: "Main",
   sending: (files: number, share: string) => (files === 1 ? `Sending: ${share}` : `Sending ${files} files: ${share}`),
   dropAnywhere: "Let go to send these files",
-  nav: { runs: "Runs", live: "Live", queue: "Queue", settings: "Settings", send: "Send a run" },
+  nav: { runs: "Runs", defects: "Defects", live: "Live", queue: "Queue", settings: "Settings", send: "Send a run" },
   unknownPage: {
     heading: "There is no such page",
     body: (path: string) => `${path} is not one of Stria's addresses.`,

@@ -213,7 +213,8 @@ async fn list(app: &App, side: &Side) -> Result<DefectList> {
 #[into_params(parameter_in = Query)]
 pub(super) struct ChangeQuery {
     /// The earlier job, of the same asset.
-    before: String,
+    #[param(required = true)]
+    before: Option<String>,
 }
 
 /// What changed from an earlier job to this one: the same asset, the same direction. A comparison that takes longer than
@@ -229,7 +230,11 @@ pub(super) async fn get_change(
     Path(job): Path<String>,
     Query(query): Query<ChangeQuery>,
 ) -> Result<Response> {
-    let (before, after) = (Side::of(&app, &query.before).await?, Side::of(&app, &job).await?);
+    let after = Side::of(&app, &job).await?;
+    let Some(before) = query.before else {
+        return Err(Error::field("before", "the query names no earlier job", "before=JOB, a job of the same asset"));
+    };
+    let before = Side::of(&app, &before).await?;
     if before.asset != after.asset {
         let found = format!("the earlier job is of {:?}, the later one of {:?}", before.asset, after.asset);
         return Err(Error::field("before", found, "two jobs of the same asset"));

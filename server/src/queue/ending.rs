@@ -43,7 +43,7 @@ pub struct Outcome {
     /// Frames read.
     pub frames: u64,
     /// The defects, where they were looked for.
-    pub defects: Option<DefectList>,
+    pub defects: Option<Box<DefectList>>,
 }
 
 impl Queue {
@@ -113,7 +113,7 @@ impl Queue {
                 .exec(&*t)
                 .await?;
         }
-        if let Some(words) = defects::publish(&*t, &lease.run, &lease.job, outcome.defects.as_ref()).await? {
+        if let Some(words) = defects::publish(&*t, &lease.run, &lease.job, outcome.defects.as_deref()).await? {
             add_log_line(&*t, &lease.job, lease.attempt, &words, &self.limits).await?;
         }
         repeat_in_run(&*t, &lease.job, JobState::Done).await?;

@@ -51,7 +51,7 @@ pub(super) async fn store(worker: &Worker, lease: &Lease, scratch: &Scratch, man
 }
 
 /// The list of defects, where there is one: read before it goes into the store.
-async fn defects(products: &[PublishedProduct], out: &Path) -> Result<Option<DefectList>> {
+async fn defects(products: &[PublishedProduct], out: &Path) -> Result<Option<Box<DefectList>>> {
     let Some(listed) = products.iter().find(|p| p.name.as_str() == defect_list::JSON_NAME) else { return Ok(None) };
     if listed.facts.bytes > MAX_LIST_BYTES {
         let found = format!("{} has {} bytes", defect_list::JSON_NAME, listed.facts.bytes);
@@ -61,7 +61,7 @@ async fn defects(products: &[PublishedProduct], out: &Path) -> Result<Option<Def
     let folder: PathBuf = out.into();
     let read = tokio::task::spawn_blocking(move || defect_list::load(&folder)).await;
     let read = read.map_err(|e| Error::Internal(format!("reading the list of defects stopped: {e}")))?;
-    read.map(Some).map_err(|e| Error::Internal(format!("the child's list of defects: {e}")))
+    read.map(|list| Some(Box::new(list))).map_err(|e| Error::Internal(format!("the child's list of defects: {e}")))
 }
 
 /// Checks a product and puts it into the store.

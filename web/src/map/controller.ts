@@ -1,7 +1,7 @@
 // The map at work: keeps the view, hears pointer and keyboard, draws when something changed. Knows nothing of the page around it.
 
 import type { Style } from "./colours.ts";
-import { drawOverlay, drawTiles, readTheme, wishes, type Chainage, type Line, type Overlay, type Theme } from "./painter.ts";
+import { drawOverlay, drawTiles, MARKER_PX, readTheme, wishes, type Chainage, type Line, type Marker, type Overlay, type Theme } from "./painter.ts";
 import { boundsOf, exists, levelAt, pixelAt, type Box, type Place, type TilesIndex } from "./pyramid.ts";
 import { TileStore } from "./tiles.ts";
 import { first, kept, toWorld, visible, whole, zoomed, type Size, type View } from "./window.ts";
@@ -39,7 +39,7 @@ export class MapController {
   private bounds: Box | null;
   private theme: Theme;
   private texture = 0;
-  private overlay: Overlay = { lines: [], cross: false, spot: null };
+  private overlay: Overlay = { markers: [], lines: [], cross: false, spot: null };
   private dirty = false;
   private rest: ReturnType<typeof setTimeout> | undefined;
   private pointers = new Map<number, { x: number; y: number }>();
@@ -100,6 +100,26 @@ export class MapController {
   setLines(lines: Line[]): void {
     this.overlay.lines = lines;
     this.draw();
+  }
+
+  setMarkers(markers: Marker[]): void {
+    this.overlay.markers = markers;
+    this.draw();
+  }
+
+  /** The marker at a place, as large as it is drawn. */
+  markerAt(place: Place): Marker | null {
+    if (this.view === null) return null;
+    const reach_mm = (MARKER_PX + 4) * this.view.mm_per_css_px;
+    const far = (marker: Marker) => Math.hypot(marker.x_mm - place.x_mm, marker.y_mm - place.y_mm);
+    const near = this.overlay.markers.filter((marker) => far(marker) <= reach_mm).sort((a, b) => far(a) - far(b));
+    return near[0] ?? null;
+  }
+
+  /** Brings a place into the middle; closer, where the map is too far away to see something of this extent. */
+  lookAt({ x_mm, y_mm }: Place, extent_mm: number): void {
+    const close = Math.max(extent_mm, 20) / 150;
+    this.show({ x_mm, y_mm, mm_per_css_px: Math.min(this.view?.mm_per_css_px ?? close, close) });
   }
 
   setSpot(spot: Place | null): void {

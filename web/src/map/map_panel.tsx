@@ -14,7 +14,7 @@ import type { Style } from "./colours.ts";
 import { ColourRange } from "./colour_range.tsx";
 import { MapController, type Hover } from "./controller.ts";
 import { Measured, useMeasure, type Tool } from "./measure.tsx";
-import type { Chainage, Line } from "./painter.ts";
+import type { Chainage, Line, Marker } from "./painter.ts";
 import type { Place, TilesIndex } from "./pyramid.ts";
 import { Layers, lookOf, type Look } from "./layers.tsx";
 import { Readout } from "./readout.tsx";
@@ -39,19 +39,35 @@ type Props = {
   /** Less around the map. */
   plain?: boolean;
   label?: string;
+  /** Numbered places, and who hears that one is clicked. */
+  markers?: Marker[];
+  onMarker?: (number: number) => void;
+  /** How far its world lies from that of the first map it is linked to. */
+  shift?: Place;
+  /** What the map looks at when this changes. */
+  target?: (Place & { extent_mm: number }) | null;
 };
 
 /** Maps that move together. */
 export class ViewLink {
-  private readonly maps = new Set<MapController>();
-  join(map: MapController): () => void {
-    this.maps.add(map);
+  /** The maps, each with how far its world lies from the first one's. */
+  private readonly maps = new Map<MapController, Place>();
+  join(map: MapController, shift: Place): () => void {
+    this.maps.set(map, shift);
     return () => this.maps.delete(map);
   }
+  place(map: MapController, shift: Place): void {
+    this.maps.set(map, shift);
+  }
   moved(from: MapController, view: View): void {
-    for (const map of this.maps) if (map !== from) map.setView(view);
+    const own = this.maps.get(from) ?? NO_SHIFT;
+    for (const [map, { x_mm, y_mm }] of this.maps) {
+      if (map !== from) map.setView({ ...view, x_mm: view.x_mm - own.x_mm + x_mm, y_mm: view.y_mm - own.y_mm + y_mm });
+    }
   }
 }
+
+const NO_SHIFT: Place = { x_mm: 0, y_mm: 0 };
 
 export function MapPanel(props: Props) {
   const { job, revision } = props;
@@ -80,7 +96,7 @@ function autoRange(index: TilesIndex): [number, number] {
   return [near - widen, far + widen];
 }
 
-function OpenMap({ run, job, index, link, plain, label }: Props & { index: TilesIndex }) {
+function OpenMap({ run, job, index, link, plain, label, markers, onMarker, target, shift }: Props & { index: TilesIndex }) {
   const base = useRef<HTMLCanvasElement>(null);
   const top = useRef<HTMLCanvasElement>(null);
   const frame = useRef<HTMLDivElement>(null);
@@ -95,8 +111,13 @@ function OpenMap({ run, job, index, link, plain, label }: Props & { index: Tiles
   const range = chosen ?? autoRange(index);
   const style: Style = { near_mm: range[0], far_mm: range[1], relief: look.relief };
   const measure = useMeasure(tool, (place) => map.current?.depthAt(place) ?? Promise.resolve(null), () => map.current?.shown() ?? null, start.cut);
-  const pick = useRef(measure.pick);
-  pick.current = measure.pick;
+  const picked = (place: Place) => {
+    const marker = tool === "move" ? map.current?.markerAt(place) : null;
+    if (marker) onMarker?.(marker.number);
+    else measure.pick(place);
+  };
+  const pick = useRef(picked);
+  pick.current = picked;
 
   useEffect(() => {
     if (base.current === null || top.current === null) return undefined;
@@ -116,7 +137,7 @@ function OpenMap({ run, job, index, link, plain, label }: Props & { index: Tiles
     top.current.dataset["ready"] = "true";
     // For tests and for the curious: how many pictures were drawn.
     Object.assign(top.current, { striaMap: made });
-    const leave = link?.join(made);
+    const leave = link?.join(made, shift ?? NO_SHIFT);
     return () => {
       clearTimeout(timer);
       leave?.();
@@ -137,6 +158,13 @@ function OpenMap({ run, job, index, link, plain, label }: Props & { index: Tiles
       cut: measure.cut === null ? null : cutInAddress(measure.cut),
     });
   }, [look, chosen, measure.cut]);
+  useEffect(() => {
+    if (map.current !== null) link?.place(map.current, shift ?? NO_SHIFT);
+  }, [shift]);
+  useEffect(() => map.current?.setMarkers(markers ?? []), [markers]);
+  useEffect(() => {
+    if (target) map.current?.lookAt(target, target.extent_mm);
+  }, [target]);
   const spot = (place: Place | null) => map.current?.setSpot(place);
 
   return (

@@ -13,6 +13,8 @@ export interface Theme {
   line: string;
   mark: string;
   halo: string;
+  /** Another colour of the style sheet by its name. */
+  of: (name: string) => string;
 }
 
 export function readTheme(element: Element): Theme {
@@ -26,6 +28,7 @@ export function readTheme(element: Element): Theme {
     line: of("--line"),
     mark: of("--mark"),
     halo: of("--halo"),
+    of,
   };
 }
 
@@ -115,7 +118,16 @@ export interface Line {
   marks: boolean;
 }
 
+/** A numbered place on the wall. */
+export interface Marker extends Place {
+  number: number;
+  /** A colour of the style sheet: `--minor` and so on. */
+  colour: string;
+  chosen: boolean;
+}
+
 export interface Overlay {
+  markers: Marker[];
   lines: Line[];
   /** Where the keyboard would set a point. */
   cross: boolean;
@@ -134,6 +146,7 @@ export function drawOverlay(context: CanvasRenderingContext2D, scene: Pick<Scene
   context.setTransform(ratio, 0, 0, ratio, 0, 0);
   context.clearRect(0, 0, size.width, size.height);
   context.font = FONT;
+  drawMarkers(context, view, size, overlay.markers, theme);
   for (const line of overlay.lines) drawLine(context, view, size, line, theme);
   if (overlay.spot !== null) drawSpot(context, view, size, overlay.spot, theme);
   if (overlay.cross) drawCross(context, size, theme);
@@ -165,6 +178,35 @@ function drawLine(context: CanvasRenderingContext2D, view: View, size: Size, lin
   if (!line.marks) return;
   for (const { x, y } of [from, to]) {
     stroke(context, theme, () => context.arc(x, y, 5, 0, 2 * Math.PI));
+  }
+}
+
+/** Radius of a marker, px. */
+export const MARKER_PX = 11;
+/** Of more markers in view than these, only dots are drawn: their numbers would hide each other. */
+const MOST_NUMBERS = 150;
+
+function drawMarkers(context: CanvasRenderingContext2D, view: View, size: Size, markers: Marker[], theme: Theme): void {
+  const box = visible(view, size);
+  const shown = markers.filter(({ x_mm, y_mm }) => x_mm >= box.left && x_mm <= box.right && y_mm >= box.top && y_mm <= box.bottom);
+  // The chosen one lies on top.
+  shown.sort((a, b) => Number(a.chosen) - Number(b.chosen));
+  const numbered = shown.length <= MOST_NUMBERS;
+  context.textAlign = "center";
+  context.textBaseline = "middle";
+  for (const marker of shown) {
+    const { x, y } = toScreen(view, size, marker);
+    const radius = marker.chosen ? MARKER_PX + 3 : numbered ? MARKER_PX : 4;
+    context.beginPath();
+    context.arc(x, y, radius, 0, 2 * Math.PI);
+    context.fillStyle = theme.card;
+    context.fill();
+    context.lineWidth = marker.chosen ? 5 : 3;
+    context.strokeStyle = theme.of(marker.colour);
+    context.stroke();
+    if (!numbered && !marker.chosen) continue;
+    context.fillStyle = theme.text;
+    context.fillText(`${marker.number}`, x, y + 0.5);
   }
 }
 

@@ -1,10 +1,12 @@
 // Two measurements of one run side by side: maps that move together, what differs in the recipes, how they came out.
 
 import { useMemo } from "preact/hooks";
-import { getJob, getManifest, getRun, type Job, type Manifest } from "../api.ts";
-import { lengthMm, count, percent } from "../format.ts";
+import { getJob, getManifest, getRun, type Job, type ChangeReport, type Manifest, type Run } from "../api.ts";
+import { lengthMm, count, localTime, percent } from "../format.ts";
 import { once, useLoaded, useTitle } from "../hooks.ts";
 import { MapPanel, ViewLink } from "../map/map_panel.tsx";
+import type { Place } from "../map/pyramid.ts";
+import { ChangePanel, changeMarkers, useChange } from "../parts/change_panel.tsx";
 import { ProblemBox } from "../parts/problem.tsx";
 import { leavesOf } from "../recipe_text.ts";
 import { Link, runPath } from "../router.tsx";
@@ -17,11 +19,12 @@ export function CompareView({ run: id, left, right }: { run: string; left: strin
   const load = async () => {
     const run = await getRun(id);
     const jobs = await Promise.all([getJob(left ?? ""), getJob(right ?? "")]);
+    // They may be of two runs of one asset.
+    const runs = await Promise.all(jobs.map((job) => (job.run === run.id ? run : getRun(job.run))));
     const manifests = jobs.every((job) => job.state === "done") ? await Promise.all(jobs.map((job) => getManifest(job.id))) : null;
-    return { run, jobs, manifests };
+    return { run, runs, jobs, manifests };
   };
   const loaded = useLoaded(`compare ${id} ${left} ${right}`, load, once);
-  const link = useMemo(() => new ViewLink(), []);
   useTitle(words.heading);
   return (
     <>
@@ -34,21 +37,53 @@ export function CompareView({ run: id, left, right }: { run: string; left: strin
       {loaded.value && loaded.value.manifests === null && <p>{words.onlyDone}</p>}
       {loaded.value?.manifests && (
         <>
-          <div class="pair">
-            {loaded.value.jobs.map((job, side) => (
-              <section key={`${side} ${job.id}`} class="card" aria-label={side === 0 ? words.left : words.right}>
-                <h2>{runTexts.jobs.job(job.recipe, job.rig)}</h2>
-                <MapPanel run={loaded.value!.run} job={job} link={link} plain label={`${side === 0 ? words.left : words.right}: ${runTexts.jobs.job(job.recipe, job.rig)}`} />
-              </section>
-            ))}
-          </div>
-          <p class="faint">{words.together}</p>
+          <Maps runs={loaded.value.runs} jobs={loaded.value.jobs} />
           <Outcome jobs={loaded.value.jobs} manifests={loaded.value.manifests} />
           <Differences jobs={loaded.value.jobs} manifests={loaded.value.manifests} />
         </>
       )}
     </>
   );
+}
+
+/** Both maps, and what changed from the one to the other. */
+function Maps({ runs, jobs }: { runs: Run[]; jobs: Job[] }) {
+  const link = useMemo(() => new ViewLink(), []);
+  const change = useChange(jobs[0]?.id ?? "", jobs[1]?.id ?? "");
+  const report = change.value?.report ?? null;
+  const shifts = useMemo(() => shiftsOf(runs, report), [runs, report]);
+  const markers = useMemo(() => shifts.map((shift) => (report === null ? [] : changeMarkers(report, shift))), [shifts, report]);
+  const two = runs[0]?.id !== runs[1]?.id;
+  return (
+    <>
+      <div class="pair">
+        {jobs.map((job, side) => {
+          const run = runs[side];
+          const name = runTexts.jobs.job(job.recipe, job.rig);
+          if (run === undefined) return null;
+          return (
+            <section key={`${side} ${job.id}`} class="card" aria-label={side === 0 ? words.left : words.right}>
+              <h2 class="words">{two ? `${localTime(run.recorded_at)} · ${run.source.filename}` : name}</h2>
+              <MapPanel run={run} job={job} link={link} plain shift={shifts[side]!} markers={markers[side]!} label={`${side === 0 ? words.left : words.right}: ${name}`} />
+            </section>
+          );
+        })}
+      </div>
+      <p class="faint">{words.together}</p>
+      <ChangePanel change={change} />
+    </>
+  );
+}
+
+/** How far each run's world lies from the earlier one's: by the chainages, and by how their surfaces were laid on each other. */
+function shiftsOf([before, after]: Run[], report: ChangeReport | null): Place[] {
+  const sign = before?.direction === "backward" ? -1 : 1;
+  const way_mm = before === undefined || after === undefined ? 0 : sign * (before.chainage_mm - after.chainage_mm);
+  const laid = report?.registration;
+  return [
+    { x_mm: 0, y_mm: 0 },
+    { x_mm: way_mm + (laid?.offset_x_mm ?? 0), y_mm: laid?.offset_y_mm ?? 0 },
+  ];
 }
 
 type Pair = { jobs: Job[]; manifests: Manifest[] };

@@ -25,18 +25,19 @@ const MapPanel = lazy(async () => (await mapOnItsWay.catch(() => import("../map/
 const PathPlots = lazy(async () => (await import("../parts/path_plots.tsx")).PathPlots);
 const Space = lazy(async () => (await import("../parts/space.tsx")).Space);
 const JobsPanel = lazy(async () => (await import("../parts/jobs_panel.tsx")).JobsPanel);
+const DefectsPanel = lazy(async () => (await import("../parts/defects_panel.tsx")).DefectsPanel);
 const LivePanel = lazy(async () => (await import("../parts/live_panel.tsx")).LivePanel);
 
 const ACTIVE_MS = 5000;
 const IDLE_MS = 60_000;
 
 type Tab = Exclude<keyof typeof runTexts.tabs, "label">;
-const TABS: Tab[] = ["live", "map", "quality", "path", "space", "files", "jobs", "log"];
+const TABS: Tab[] = ["live", "map", "defects", "quality", "path", "space", "files", "jobs", "log"];
 
 /** The parts that a job has something for. */
 function tabsOf(job: Job): Tab[] {
   if (isActive(job)) return ["live", "map", "space", "jobs", "log"];
-  if (job.state === "done") return ["map", "quality", "path", "space", "files", "jobs", "log"];
+  if (job.state === "done") return ["map", "defects", "quality", "path", "space", "files", "jobs", "log"];
   return ["jobs", "log"];
 }
 
@@ -118,6 +119,8 @@ function Part({ tab, run, job, jobs, live, onChanged }: PartProps) {
           <MapPanel run={run} job={job} revision={live.tiles} />
         </>
       );
+    case "defects":
+      return <DefectsPanel run={run} job={job} />;
     case "quality":
       return <Quality job={job} />;
     case "path":
