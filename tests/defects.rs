@@ -14,6 +14,9 @@ struct Made {
     folder: TempDir,
 }
 
+/// The operator's codes of these tests.
+const CODES: &str = "defects.codes=dent=BAA; bulge=BAA; dent.severe=BAA A";
+
 impl Made {
     /// Simulates a scene and processes it.
     fn new(scene: &str, options: &[&str]) -> Made {
@@ -23,7 +26,7 @@ impl Made {
         simulate.extend(options);
         succeed(&simulate, &[0]);
         let made = Made { folder };
-        made.process(&products, "depth,texture,defects,report", &[]);
+        made.process(&products, "depth,texture,defects,report", &["--set", CODES]);
         made
     }
 
@@ -114,6 +117,12 @@ fn every_known_defect_is_found_with_its_kind_and_figures_and_nothing_else() {
         let slack = if area < 2000.0 { 0.4 } else { 0.15 };
         assert!((number(found, "area_mm2") / area - 1.0).abs() < slack, "{area} mm²: {found:#}");
         assert!((number(found, "chainage_mm") - number(found, "x_mm") - 12000.0).abs() < 0.01);
+        let code = match (kind, found["severity"].as_str()) {
+            ("dent", Some("severe")) => "BAA A".into(),
+            ("dent" | "bulge", _) => "BAA".into(),
+            _ => Value::Null,
+        };
+        assert_eq!(found["code"], code, "{found:#}");
     }
 }
 
@@ -217,7 +226,7 @@ fn what_cannot_be_compared_is_refused_in_words() {
 fn the_report_is_one_page_without_anything_to_fetch() {
     let made = damaged();
     let page = std::fs::read_to_string(made.products().join("report.html")).expect("a report");
-    assert!(page.contains("Tunnel &lt;3&gt;") && page.contains("Detection limit"));
+    assert!(page.contains("Tunnel &lt;3&gt;") && page.contains("Detection limit") && page.contains("<td>BAA</td>"));
     for defect in made.defects() {
         assert!(page.contains(&format!("id=\"d{}\"", defect["id"])), "{defect:#} has its block");
     }

@@ -24,6 +24,7 @@ pub mod preview;
 mod pyramid;
 pub mod report;
 pub mod residual_tif;
+pub mod residual_tiles;
 pub mod section_csv;
 pub mod sections_csv;
 pub mod texture;

@@ -3,12 +3,19 @@
 //! A recipe is read from TOML (or a built-in name), changed with `--set key=value`, checked, and kept
 //! with every result. Unknown keys are refused.
 
+mod codes;
+
 use serde::{Deserialize, Serialize};
 use serde_json::Value;
 
 use crate::error::{Error, Result};
 use crate::motion::track::TrackUse;
 use crate::stripe::SpotChoice;
+
+pub use codes::Codes;
+
+/// The severities of defects, the mildest first.
+pub const SEVERITIES: [&str; 3] = ["minor", "moderate", "severe"];
 
 /// The built-in recipes, the default first.
 pub const BUILT_IN: [&str; 3] = ["metric", "paper", "paper-literal"];
@@ -32,6 +39,11 @@ pub enum Range {
     Choice {
         /// The words.
         of: Vec<&'static str>,
+    },
+    /// Words.
+    Text {
+        /// Most characters.
+        max_chars: usize,
     },
 }
 
@@ -71,6 +83,10 @@ fn whole(min: u32, max: u32) -> Range {
 
 fn choice(of: &[&'static str]) -> Range {
     Range::Choice { of: of.to_vec() }
+}
+
+fn text(max_chars: usize) -> Range {
+    Range::Text { max_chars }
 }
 
 fn flag() -> Range {
@@ -267,6 +283,9 @@ recipe! {
         nominal_radius_mm: f64 = 0.0, "mm", number(0.0, 1000000.0);
         /// Length of the stretch that one row of sections.csv measures.
         section_step_mm: f64 = 100.0, "mm", number(10.0, 100000.0);
+        /// The operator's own codes, written into every list and report: kind=code or kind.severity=code, separated by
+        /// semicolons, such as dent=BAA; step=BAJ; dent.severe=BAA B; the more specific one counts.
+        codes: String = String::new(), "", text(2000);
         /// Most defects that are listed, the deepest first; what is left out is counted.
         list_max: u32 = 2000, "", whole(1, 100000);
     }
@@ -382,6 +401,7 @@ impl OptionInfo {
             }
             Range::Flag => "true or false".into(),
             Range::Choice { of } => format!("one of {}", of.join(", ")),
+            Range::Text { max_chars } => format!("at most {max_chars} characters"),
         }
     }
 
@@ -390,7 +410,7 @@ impl OptionInfo {
             Range::Number { whole: true, .. } => text.parse::<u64>().ok().map(Value::from),
             Range::Number { .. } => text.parse::<f64>().ok().map(Value::from),
             Range::Flag => text.parse::<bool>().ok().map(Value::from),
-            Range::Choice { .. } => Some(Value::from(text)),
+            Range::Choice { .. } | Range::Text { .. } => Some(Value::from(text)),
         }
     }
 
@@ -399,11 +419,23 @@ impl OptionInfo {
             Range::Number { min, max, .. } => value.as_f64().is_some_and(|v| v >= *min && v <= *max),
             Range::Flag => value.is_boolean(),
             Range::Choice { of } => value.as_str().is_some_and(|v| of.contains(&v)),
+            Range::Text { max_chars } => value.as_str().is_some_and(|v| v.chars().count() <= *max_chars),
         };
         if fits {
-            return Ok(());
+            return self.check_words(subject, value);
         }
         Err(Error::field(subject, self.key, format!("{value} {}", self.unit).trim_end(), self.expected()))
+    }
+}
+
+impl OptionInfo {
+    /// What a text must be besides short.
+    fn check_words(&self, subject: &str, value: &Value) -> Result<()> {
+        if self.key != "defects.codes" {
+            return Ok(());
+        }
+        let codes = Codes::parse(value.as_str().unwrap_or_default());
+        codes.map(|_| ()).map_err(|(found, expected)| Error::field(subject, self.key, found, expected))
     }
 }
 
@@ -451,6 +483,7 @@ mod tests {
             ("nothing", "1", "groups"),
             ("stripe.keep", "yes", "true or false"),
             ("motion.corners", "10.5", "whole"),
+            ("defects.codes", "crack=BAB", "missing_material"),
         ] {
             let message = recipe.set(key, value).expect_err(key).to_string();
             assert!(message.contains(part), "{message}");

@@ -26,6 +26,7 @@ mod metrics;
 mod page;
 mod problem;
 mod recording;
+mod residual;
 mod retention;
 mod rigs;
 mod runs;
@@ -150,6 +151,7 @@ fn routes() -> OpenApiRouter<App> {
         .routes(routes!(defects::get_defect, defects::change_defect))
         .routes(routes!(defects::get_history))
         .routes(routes!(change::get_change))
+        .routes(routes!(residual::get_residual))
         .routes(routes!(retention::preview_retention))
         .routes(routes!(retention::get_pin, retention::pin_run, retention::unpin_run))
         .routes(routes!(batches::list_batches, batches::create_batch))

@@ -98,14 +98,25 @@ test("a run's defects stand numbered on its map, at their places", async () => {
   const third = defects[2];
   await list.nth(2).getByRole("button", { name: /^Show on the map/ }).click();
   await until("the map looks there", 5000, async () => Math.hypot((await view()).x_mm - third.x_mm, (await view()).y_mm - third.y_mm) < 1);
-  assert.equal(await list.nth(2).getAttribute("class"), "chosen");
+  assert.equal(await list.nth(2).getAttribute("class"), "picked");
   // A click on another's mark chooses it; a ring of its colour is drawn where the defect is.
   await page.getByRole("button", { name: "Whole map" }).click();
   await mapSettled(page);
   const fourth = defects[3];
   const place = await onPage(page, fourth.x_mm, fourth.y_mm);
   await page.mouse.click(place.x, place.y);
-  await until("the click chose it", 5000, async () => (await list.nth(3).getAttribute("class")) === "chosen");
+  await until("the click chose it", 5000, async () => (await list.nth(3).getAttribute("class")) === "picked");
+  // The residual map as a layer: what it tells under the pointer is about the defect's depth, without the wall's distance.
+  await page.getByRole("radio", { name: "Deviation" }).check({ force: true });
+  await list.nth(2).getByRole("button", { name: /^Show on the map/ }).click();
+  await mapSettled(page);
+  await page.locator(".map-top").scrollIntoViewIfNeeded();
+  const middle = await onPage(page, third.x_mm, third.y_mm);
+  await page.mouse.move(middle.x, middle.y);
+  const told = page.locator(".readout .depth dd");
+  const deviation = await until("the value is known", 10_000, async () => Number(await told.getAttribute("data-z").catch(() => null)) || null);
+  assert.ok(Math.abs(deviation - third.depth_mm) < Math.max(1.5, 0.4 * Math.abs(third.depth_mm)), `${deviation} mm at a defect of ${third.depth_mm} mm`);
+  assert.equal(new URL(page.url()).searchParams.get("layer"), "deviation");
   // The report opens in a page of its own, where nothing of it can run.
   const opened = page.context().waitForEvent("page");
   await page.getByRole("link", { name: "Open the report" }).click();
@@ -140,6 +151,7 @@ test("in light and dark and at three widths", async () => {
     await mapSettled(page);
     await page.locator(".plot canvas").first().waitFor();
   });
+  await lookAround(browser, server, "run-deviation", `/runs/${first.id}?tab=defects&layer=deviation`, mapSettled);
   await lookAround(browser, server, "change", `/runs/${second.id}/compare?left=${first.job.id}&right=${second.job.id}`, async (page) => {
     for (const side of [0, 1]) await mapSettled(page, page.locator(".pair section").nth(side));
     await page.getByRole("region", { name: "What changed on the wall" }).waitFor();

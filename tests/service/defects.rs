@@ -37,6 +37,10 @@ fn listed(server: &Server, query: &str) -> Vec<Value> {
     items(&server.json(&format!("/api/defects?{query}")))
 }
 
+fn pathed(value: usize) -> std::path::PathBuf {
+    value.to_string().into()
+}
+
 fn number(value: &Value, field: &str) -> f64 {
     value[field].as_f64().unwrap_or_else(|| panic!("{field} in {value:#}"))
 }
@@ -136,6 +140,24 @@ fn defects_of_all_runs_are_listed_judged_and_outlive_reprocessing() {
     }
     assert_eq!(read("defect_tables.py", &[folder.path()]), json!(all.len()));
 
+    // The residual map as tiles: the defect's own depth in its middle.
+    let tiles = format!("/api/jobs/{job}/residual");
+    let index = server.json(&format!("{tiles}/tiles.json"));
+    let deepest = all.iter().max_by(|a, b| number(a, "depth_mm").total_cmp(&number(b, "depth_mm"))).expect("some");
+    let grid = |name: &str| number(&index["grid"], name);
+    let own = own.iter().find(|d| d["id"] == deepest["number"]).expect("the product's");
+    let pixel = |field: &str, origin: &str| ((number(own, field) - grid(origin)) / grid("mm_per_px")).round() as usize;
+    let (column, row) = (pixel("deepest_x_mm", "x0_mm"), pixel("deepest_y_mm", "y0_mm"));
+    let answer = send(server.get(&format!("{tiles}/depth/0/{}_{}.png", column / 256, row / 256)));
+    assert_eq!(header(&answer, "content-type"), "image/png");
+    assert!(header(&answer, "cache-control").contains("immutable"));
+    keep("tile.png", &answer.bytes().expect("a body"));
+    let told = read("deviation_at.py", &[&folder.path().join("tile.png"), &pathed(column % 256), &pathed(row % 256)]);
+    let told = told.as_f64().expect("a value");
+    assert!((told - number(deepest, "depth_mm")).abs() < 1.0, "{told}: {deepest:#}");
+    problem_of(send(server.get(&format!("{tiles}/depth/0/99_0.png"))), 404);
+    problem_of(send(server.get(&format!("{tiles}/depth/0/0_0.jpg"))), 404);
+
     // A run that is moved and turned takes its defects along.
     let moved = json!({"chainage_mm": 5000, "direction": "backward", "asset": "Gallery 4"});
     json_of(send(server.patch(&format!("/api/runs/{run_id}")).json(&moved)), 200);
@@ -145,12 +167,17 @@ fn defects_of_all_runs_are_listed_judged_and_outlive_reprocessing() {
     }
 
     // Processed again: the list shows the new job's, with what was said.
-    let wish = json!({"recipe": "[defects]\nnoise_factor = 5.0\n"});
+    let wish = json!({"recipe": "[defects]\nnoise_factor = 5.0\ncodes = \"dent=BAA; bulge=BAA B\"\n"});
     let again = json_of(send(server.post(&format!("/api/runs/{run_id}/jobs")).json(&wish)), 201);
     let again = text(&again, "/id");
     server.wait_for_state(&again, "done");
     let now = listed(&server, "sort=-chainage");
     assert!(!now.is_empty() && now.iter().all(|d| text(d, "/job") == again && d["current"] == true));
+    for defect in &now {
+        assert_eq!(defect["code"], if defect["kind"] == "dent" { "BAA" } else { "BAA B" }, "{defect:#}");
+    }
+    let coded = send(server.get("/api/defects.csv?q=BAA%20B")).text().expect("text");
+    assert!(coded.lines().count() > 1 && coded.lines().skip(1).all(|l| l.contains(",BAA B,")), "{coded}");
     let kept: Vec<&Value> = now.iter().filter(|d| d["state"] == "watched").collect();
     assert_eq!(kept.len(), 1, "{now:#?}");
     assert_eq!(kept[0]["carried_from"], all[0]["id"]);

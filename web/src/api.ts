@@ -300,10 +300,13 @@ export const getTrajectory = (job: string): Promise<Trajectory> => json(`/api/jo
 /** Where a job's tiles are, also while it runs. */
 export const tilesFolder = (job: string): string => `/api/jobs/${at(job)}/tiles`;
 
-/** What tiles a job has; null where there are none (yet). */
-export async function getTilesIndex(job: string): Promise<TilesIndex | null> {
+/** Where the tiles are that show how far the wall lies from its undamaged shape. */
+export const deviationFolder = (job: string): string => `/api/jobs/${at(job)}/residual`;
+
+/** What tiles a folder has; null where there are none (yet). */
+export async function getTilesIndex(folder: string): Promise<TilesIndex | null> {
   try {
-    return await json<TilesIndex>(`${tilesFolder(job)}/tiles.json`, { cache: "no-cache" });
+    return await json<TilesIndex>(`${folder}/tiles.json`, { cache: "no-cache" });
   } catch (error) {
     if (error instanceof ApiError && error.problem.status === 404) return null;
     throw error;

@@ -350,7 +350,8 @@ fn value_bytes(z_mm: f32) -> [u8; 3] {
     [red, green, blue]
 }
 
-fn depth_png(depth_mm: &[f32]) -> Result<Vec<u8>> {
+/// A depth tile of `TILE_SIDE_PX * TILE_SIDE_PX` values in mm, NaN where not measured.
+pub(super) fn depth_png(depth_mm: &[f32]) -> Result<Vec<u8>> {
     let rgb: Vec<u8> = depth_mm.iter().flat_map(|z| value_bytes(*z)).collect();
     let mut bytes = Vec::new();
     let mut encoder = Encoder::new(&mut bytes, TILE_SIDE_PX as u32, TILE_SIDE_PX as u32);

@@ -27,7 +27,7 @@ use crate::export::tiles::{TileGrid, TileWriter};
 use crate::export::trajectory_csv::{TrajectoryRow, TrajectoryWriter};
 use crate::export::{defect_list, depth_png, depth_tif, sections_csv, texture};
 use crate::motion::track::TrackUse;
-use crate::recipe::{DefectOptions, Method};
+use crate::recipe::{Codes, DefectOptions, Method};
 use crate::recording::{FrameSteps, RecordedRun, Recordings, Segment};
 use crate::rig::{LineDirection, Rig};
 use crate::source::{self, Beside, SourceInfo};
@@ -499,7 +499,12 @@ fn find_defects(
     let start = Instant::now();
     let mut residual = ResidualWriter::new(folder, residual_tif::NAME);
     let found = defects::find(map, options, chainage, profile_step_mm, &mut |strip| residual.push(strip))?;
-    let Some(findings) = found else { return Ok(None) };
+    let Some(mut findings) = found else { return Ok(None) };
+    let codes = Codes::parse(&options.codes)
+        .map_err(|(found, expected)| Error::field("recipe", "defects.codes", found, expected))?;
+    for defect in &mut findings.list.defects {
+        defect.code = codes.of(defect.kind, &defect.severity).map(String::from);
+    }
     residual.finish()?;
     defect_list::write(&findings.list, folder)?;
     sections_csv::write(&findings.sections, folder)?;

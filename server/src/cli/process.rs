@@ -304,6 +304,7 @@ fn options_help() -> String {
             Range::Number { min, max, .. } => format!("{min} to {max} {unit}"),
             Range::Flag => "true or false".into(),
             Range::Choice { of } => of.join(", "),
+            Range::Text { max_chars } => format!("at most {max_chars} characters"),
         };
         text += &format!("  {key} = {default}, {}\n          {doc}\n", range.trim_end());
     }

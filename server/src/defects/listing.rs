@@ -2,15 +2,13 @@
 
 use sea_orm::{ColumnTrait, Condition, EntityTrait, Order, QueryFilter, QueryOrder, QuerySelect};
 use stria_core::defects::DefectKind;
+use stria_core::recipe::SEVERITIES;
 
 use super::{Defects, defect_of};
 use crate::db::tables::defect;
 use crate::error::{Error, Result};
 use crate::runs::{Page, with_words};
 use crate::wire::{self, DefectState};
-
-/// The severities that a recipe tells apart.
-const SEVERITIES: [&str; 3] = ["minor", "moderate", "severe"];
 
 /// Which defects to list.
 #[derive(Clone, Debug, Default)]

@@ -132,8 +132,7 @@ impl Changes {
 
     async fn work_out(&self, app: &App, task: Task) -> Result<ChangeReport> {
         let _turn = self.turns.acquire().await.map_err(|e| Error::Internal(e.to_string()))?;
-        let (app, runtime) = (app.clone(), tokio::runtime::Handle::current());
-        let read = (list(&app, &task.before).await?, list(&app, &task.after).await?);
+        let read = (list(app, &task.before).await?, list(app, &task.after).await?);
         let residual = |job: String| {
             let app = app.clone();
             async move {
@@ -144,7 +143,6 @@ impl Changes {
         let files = (residual(task.before.job.clone()).await?, residual(task.after.job.clone()).await?);
         let stop = app.stop.clone();
         let worked = tokio::task::spawn_blocking(move || {
-            let _inside = runtime.enter();
             let path = FilePath::new(residual_tif::NAME);
             let (mut before, mut after) = (ResidualFile::read(files.0, path)?, ResidualFile::read(files.1, path)?);
             let found = change::compare(

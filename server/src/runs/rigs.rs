@@ -85,6 +85,7 @@ pub fn options() -> Vec<wire::RecipeOption> {
         range: match o.range {
             recipe::Range::Number { min, max, whole } => OptionRange::Number { min, max, whole },
             recipe::Range::Flag => OptionRange::Flag,
+            recipe::Range::Text { max_chars } => OptionRange::Text { max_chars },
             recipe::Range::Choice { of } => OptionRange::Choice { of: of.into_iter().map(Into::into).collect() },
         },
         doc: o.doc,

@@ -116,6 +116,11 @@ pub enum OptionRange {
         /// The words.
         of: Vec<String>,
     },
+    /// Words.
+    Text {
+        /// Most characters.
+        max_chars: usize,
+    },
 }
 
 /// A tunable of the processing.

@@ -33,7 +33,7 @@ function levelFor(index: TilesIndex): number {
 
 /** Loads a job's points; null where there are none. */
 export async function loadPoints(job: string, progress: (share: number) => void, signal: AbortSignal): Promise<Points | null> {
-  const index = await getTilesIndex(job);
+  const index = await getTilesIndex(tilesFolder(job));
   const range = index === null ? undefined : index.levels[levelFor(index)];
   if (index === null || range === undefined) return null;
   const addresses: [number, number][] = [];

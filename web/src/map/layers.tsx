@@ -17,22 +17,27 @@ const LOOKS: Record<Name, Look> = {
 
 export const lookOf = (name: Name): Look => LOOKS[name];
 
-export function Layers({ look, onChange }: { look: Look; onChange: (look: Look) => void }) {
+type Props = { look: Look; onChange: (look: Look) => void; withImage: boolean };
+
+export function Layers({ look, onChange, withImage }: Props) {
+  const names = (Object.keys(LOOKS) as Name[]).filter((name) => withImage || name !== "image");
   const named = (Object.keys(LOOKS) as Name[]).find((name) => LOOKS[name].image === look.image && LOOKS[name].relief === look.relief);
   return (
     <div class="layers">
       <div class="segments" role="radiogroup" aria-label={mapTexts.layers}>
-        {(Object.keys(LOOKS) as Name[]).map((name) => (
+        {names.map((name) => (
           <label key={name} class={name === named ? "on" : ""}>
             <input type="radio" name="map-layer" class="unseen" checked={name === named} onChange={() => onChange(LOOKS[name])} onClick={() => onChange(LOOKS[name])} />
             {mapTexts.layer[name]}
           </label>
         ))}
       </div>
-      <label class="slider">
-        <span>{mapTexts.fadeImage}</span>
-        <input type="range" min={0} max={1} step={0.05} value={look.image} onInput={(event) => onChange({ ...look, image: Number(event.currentTarget.value) })} />
-      </label>
+      {withImage && (
+        <label class="slider">
+          <span>{mapTexts.fadeImage}</span>
+          <input type="range" min={0} max={1} step={0.05} value={look.image} onInput={(event) => onChange({ ...look, image: Number(event.currentTarget.value) })} />
+        </label>
+      )}
       <label class="slider">
         <span>{mapTexts.fadeRelief}</span>
         <input type="range" min={0} max={1} step={0.05} value={look.relief} onInput={(event) => onChange({ ...look, relief: Number(event.currentTarget.value) })} />

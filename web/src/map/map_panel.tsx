@@ -3,7 +3,7 @@
 import "./map.css";
 import { useEffect, useMemo, useRef, useState } from "preact/hooks";
 import type { Cut, Job, Run } from "../api.ts";
-import { getTilesIndex, isActive, tilesFolder } from "../api.ts";
+import { deviationFolder, getTilesIndex, isActive, tilesFolder } from "../api.ts";
 import { copyText } from "../clipboard.ts";
 import { useLoaded } from "../hooks.ts";
 import { lazy } from "../lazy.tsx";
@@ -39,6 +39,8 @@ type Props = {
   /** Less around the map. */
   plain?: boolean;
   label?: string;
+  /** Shows how far the wall lies from its undamaged shape, instead of its depth. */
+  deviation?: boolean;
   /** Numbered places, and who hears that one is clicked. */
   markers?: Marker[];
   onMarker?: (number: number) => void;
@@ -70,18 +72,19 @@ export class ViewLink {
 const NO_SHIFT: Place = { x_mm: 0, y_mm: 0 };
 
 export function MapPanel(props: Props) {
-  const { job, revision } = props;
-  const index = useLoaded(`tiles ${job.id} ${job.state}`, () => getTilesIndex(job.id), (found) => (isActive(job) && !found?.complete ? GROWING_MS : null));
+  const { job, revision, deviation } = props;
+  const folder = deviation ? deviationFolder(job.id) : tilesFolder(job.id);
+  const index = useLoaded(`tiles ${folder} ${job.state}`, () => getTilesIndex(folder), (found) => (isActive(job) && !found?.complete ? GROWING_MS : null));
   const seen = useRef(revision);
   useEffect(() => {
     if (seen.current !== revision) index.reload();
     seen.current = revision;
   }, [revision]);
   // While the job writes its last products the map of a moment ago is still a map.
-  const kept = useRef<{ job: string; index: TilesIndex } | null>(null);
-  if (index.value) kept.current = { job: job.id, index: index.value };
-  const shown = index.value ?? (kept.current?.job === job.id ? kept.current.index : null);
-  if (shown !== null && shown.levels.length > 0) return <OpenMap key={job.id} {...props} index={shown} />;
+  const kept = useRef<{ folder: string; index: TilesIndex } | null>(null);
+  if (index.value) kept.current = { folder, index: index.value };
+  const shown = index.value ?? (kept.current?.folder === folder ? kept.current.index : null);
+  if (shown !== null && shown.levels.length > 0) return <OpenMap key={folder} {...props} folder={folder} index={shown} />;
   return (
     <div class="map-empty">
       {index.problem && <ProblemBox problem={index.problem} onRetry={index.reload} />}
@@ -96,12 +99,12 @@ function autoRange(index: TilesIndex): [number, number] {
   return [near - widen, far + widen];
 }
 
-function OpenMap({ run, job, index, link, plain, label, markers, onMarker, target, shift }: Props & { index: TilesIndex }) {
+function OpenMap({ run, job, index, link, plain, label, markers, onMarker, target, shift, deviation, folder }: Props & { index: TilesIndex; folder: string }) {
   const base = useRef<HTMLCanvasElement>(null);
   const top = useRef<HTMLCanvasElement>(null);
   const frame = useRef<HTMLDivElement>(null);
   const map = useRef<MapController | null>(null);
-  const start = useMemo(() => readAddress(plain === true), []);
+  const start = useMemo(() => readAddress(plain === true, deviation === true), []);
   const [look, setLook] = useState<Look>(start.look);
   const [chosen, setChosen] = useState<[number, number] | null>(start.range);
   const [hover, setHover] = useState<Hover | null>(null);
@@ -122,7 +125,7 @@ function OpenMap({ run, job, index, link, plain, label, markers, onMarker, targe
   useEffect(() => {
     if (base.current === null || top.current === null) return undefined;
     let timer: ReturnType<typeof setTimeout> | undefined;
-    const made = new MapController(base.current, top.current, index, tilesFolder(job.id), style, chainage, {
+    const made = new MapController(base.current, top.current, index, folder, style, chainage, {
       view: (view) => {
         link?.moved(made, view);
         if (plain) return;
@@ -171,7 +174,7 @@ function OpenMap({ run, job, index, link, plain, label, markers, onMarker, targe
     <div class={plain ? "map-panel plain" : "map-panel"} ref={frame}>
       {!plain && (
         <div class="map-bar">
-          <Layers look={look} onChange={setLook} />
+          <Layers look={look} onChange={setLook} withImage={!deviation} />
           <ColourRange range={range} auto={autoRange(index)} chosen={chosen !== null} onChange={setChosen} />
         </div>
       )}
@@ -193,7 +196,7 @@ function OpenMap({ run, job, index, link, plain, label, markers, onMarker, targe
           {settled ? "" : mapTexts.sharpening}
         </span>
       </div>
-      <Readout hover={hover} chainage={chainage} />
+      <Readout hover={hover} chainage={chainage} value={deviation ? mapTexts.cursor.deviation : mapTexts.cursor.depth} />
       {!plain && (
         <>
           <div class="map-tools">
@@ -246,7 +249,7 @@ function cutInAddress(cut: Cut): string {
 }
 
 /** What the address says about the map; nonsense in it counts as not said. */
-function readAddress(plain: boolean): { view: View | null; look: Look; range: [number, number] | null; cut: Cut | null } {
+function readAddress(plain: boolean, deviation: boolean): { view: View | null; look: Look; range: [number, number] | null; cut: Cut | null } {
   const query = plain ? new URLSearchParams() : readQuery();
   const numbers = (name: string, count: number): number[] | null => {
     const values = (query.get(name) ?? "").split(",").map(Number);
@@ -256,11 +259,13 @@ function readAddress(plain: boolean): { view: View | null; look: Look; range: [n
   const [image, relief] = numbers("look", 2) ?? [];
   const [near, far] = numbers("range", 2) ?? [];
   const cut = numbers("cut", 4);
+  // Each kind of map has its own colours; the deviation comes without the image.
+  const own = (readQuery().get("layer") === "deviation") === deviation;
   const share = (value: number) => Math.min(Math.max(value, 0), 1);
   return {
     view: x_mm !== undefined && y_mm !== undefined && mm_per_css_px !== undefined && mm_per_css_px > 0 ? { x_mm, y_mm, mm_per_css_px } : null,
-    look: image !== undefined && relief !== undefined ? { image: share(image), relief: share(relief) } : lookOf("depth"),
-    range: near !== undefined && far !== undefined && near < far ? [near, far] : null,
+    look: image !== undefined && relief !== undefined && own ? { image: share(image), relief: share(relief) } : lookOf("depth"),
+    range: own && near !== undefined && far !== undefined && near < far ? [near, far] : null,
     cut: cut === null ? null : { from_mm: [cut[0]!, cut[1]!], to_mm: [cut[2]!, cut[3]!] },
   };
 }

@@ -6,7 +6,7 @@ import type { Chainage } from "./painter.ts";
 
 const words = mapTexts.cursor;
 
-export function Readout({ hover, chainage }: { hover: Hover | null; chainage: Chainage }) {
+export function Readout({ hover, chainage, value }: { hover: Hover | null; chainage: Chainage; value: string }) {
   if (hover === null) return <p class="readout faint">{words.none}</p>;
   const { place, z_mm, exact } = hover;
   const depth = z_mm === null ? (exact ? words.hole : "…") : exact ? words.exact(z_mm) : words.about(z_mm);
@@ -21,7 +21,7 @@ export function Readout({ hover, chainage }: { hover: Hover | null; chainage: Ch
         <dd>{words.heightMm(place.y_mm)}</dd>
       </div>
       <div class="depth">
-        <dt>{words.depth}</dt>
+        <dt>{value}</dt>
         <dd data-z={exact && z_mm !== null ? z_mm : undefined} data-x={place.x_mm} data-y={place.y_mm}>
           {depth}
         </dd>

@@ -17,6 +17,9 @@ const words = defectTexts.run;
 /** Defects that are shown of one run, the deepest; the files hold all. */
 const MOST = 1000;
 
+type Layer = keyof typeof words.layer;
+const LAYERS = Object.keys(words.layer) as Layer[];
+
 export function DefectsPanel({ run, job }: { run: Run; job: Job }) {
   const load = async () => {
     const file = await getDefectList(job.id);
@@ -53,6 +56,7 @@ function Numbered({ run, job, defects: given }: { run: Run; job: Job; defects: D
   const [chosen, setChosen] = useState<number | null>(() => Number(readQuery().get("no")) || null);
   const [open, setOpen] = useState<Defect | null>(null);
   const [target, setTarget] = useState<{ x_mm: number; y_mm: number; extent_mm: number } | null>(null);
+  const [layer, setLayer] = useState<Layer>(() => (readQuery().get("layer") === "deviation" ? "deviation" : "wall"));
   const markers = useMemo<Marker[]>(() => defects.map(({ number, x_mm, y_mm, severity }) => ({ number, x_mm, y_mm, colour: `--${severity}`, chosen: number === chosen })), [defects, chosen]);
   useEffect(() => {
     if (chosen !== null) document.getElementById(`defect-${chosen}`)?.scrollIntoView({ block: "nearest" });
@@ -68,7 +72,26 @@ function Numbered({ run, job, defects: given }: { run: Run; job: Job; defects: D
   };
   return (
     <>
-      <MapPanel run={run} job={job} markers={markers} onMarker={setChosen} target={target} label={words.mapLabel} />
+      <div class="segments" role="radiogroup" aria-label={words.layers}>
+        {LAYERS.map((each) => (
+          <label key={each} class={each === layer ? "on" : ""}>
+            <input
+              type="radio"
+              name="defects-layer"
+              class="unseen"
+              checked={each === layer}
+              onChange={() => {
+                // The other map has colours of its own.
+                writeQuery({ layer: each === "wall" ? null : each, range: null, look: null });
+                setLayer(each);
+              }}
+            />
+            {words.layer[each]}
+          </label>
+        ))}
+      </div>
+      {layer === "deviation" && <p class="faint">{words.layerHint}</p>}
+      <MapPanel run={run} job={job} deviation={layer === "deviation"} markers={markers} onMarker={setChosen} target={target} label={words.mapLabel} />
       {defects.length > 0 && (
         <>
           <ol class="defect-list" aria-label={words.heading} tabIndex={0}>
@@ -76,7 +99,7 @@ function Numbered({ run, job, defects: given }: { run: Run; job: Job; defects: D
               const name = defectTexts.one(defect.number, defectTexts.kind(defect.kind));
               const place = defectTexts.place(defect.clock_h, defect.height_mm);
               return (
-                <li key={defect.id} id={`defect-${defect.number}`} class={defect.number === chosen ? "chosen" : ""}>
+                <li key={defect.id} id={`defect-${defect.number}`} class={defect.number === chosen ? "picked" : ""}>
                   <button type="button" class="small number" aria-label={defectTexts.onMapOf(name)} aria-pressed={defect.number === chosen} onClick={() => choose(defect)}>
                     {defect.number}
                   </button>

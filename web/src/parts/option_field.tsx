@@ -9,10 +9,16 @@ const words = runTexts.again;
 
 /** What is wrong with a value, in words; null where nothing is. */
 export function problemWith({ range, unit }: RecipeOption, value: string): string | null {
+  if (range.kind === "text") return unquoted(value).length <= range.max_chars ? null : words.bad(words.textRange(range.max_chars));
   if (range.kind !== "number") return null;
   const number = Number(value.trim());
   const good = value.trim() !== "" && Number.isFinite(number) && number >= range.min && number <= range.max && (!range.whole || Number.isInteger(number));
   return good ? null : words.bad((range.whole ? words.whole : "") + words.range(range.min, range.max, unit));
+}
+
+/** A text as people write it, from how TOML does. */
+function unquoted(toml: string): string {
+  return /^".*"$/.test(toml) ? (JSON.parse(toml) as string) : toml.replace(/^'(.*)'$/, "$1");
 }
 
 type Props = {
@@ -52,6 +58,7 @@ export function OptionField({ option, base, value, onChange }: Props) {
           </select>
         )}
         {option.range.kind === "number" && <input {...aria} inputMode="decimal" autoComplete="off" value={shown} onInput={(event) => onChange(event.currentTarget.value)} />}
+        {option.range.kind === "text" && <input {...aria} autoComplete="off" spellcheck={false} value={unquoted(shown)} onInput={(event) => onChange(tomlOf(event.currentTarget.value))} />}
         {value !== null && (
           <button type="button" class="quiet small" aria-label={`${words.reset}: ${option.key}`} title={words.reset} onClick={() => onChange(null)}>
             ↺

@@ -46,6 +46,7 @@ export const mapTexts = {
     chainage: "Chainage",
     height: "y",
     depth: "Depth",
+    deviation: "Off the undamaged shape",
     hole: "not measured",
     exact: fine,
     about: (mm: number) => `≈ ${mm.toLocaleString(undefined, { maximumFractionDigits: 1 })}\u00a0mm`,

@@ -193,6 +193,7 @@ export const runTexts = {
     range: (min: number, max: number, unit: string) => `${min.toLocaleString()} to ${max.toLocaleString()}${unit === "" ? "" : ` ${unit}`}`,
     bad: (expected: string) => `Expected ${expected}`,
     whole: "a whole number, ",
+    textRange: (chars: number) => `at most ${count(chars)} characters`,
     start: "Measure again",
     groups: {
       "": "Method",

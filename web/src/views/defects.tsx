@@ -115,14 +115,10 @@ function DefectRow({ defect, onOpen }: { defect: Defect; onOpen: () => void }) {
         </span>
       </div>
       <div class="defect-words">
-        <span>
-          <strong>{defect.asset}</strong>{" "}
-          <span class="faint">
-            {words.at(defect.chainage_mm)}
-            {place !== "" && `, ${place}`}
-          </span>
+        <strong>{defect.asset}</strong>
+        <span class="faint">
+          {[`${words.chainage(defect.chainage_mm)}${place === "" ? "" : `, ${place}`}`, defect.code, defect.comment].filter(Boolean).join(" · ")}
         </span>
-        <span class="faint">{[defect.code, defect.comment].filter(Boolean).join(" · ")}</span>
       </div>
       <div>
         <Decision state={defect.state} />
