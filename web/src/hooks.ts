@@ -1,6 +1,6 @@
 // What several views need: the page's title, data that is loaded and kept fresh, a job followed live.
 
-import { useEffect, useRef, useState } from "preact/hooks";
+import { useEffect, useMemo, useRef, useState } from "preact/hooks";
 import { followJob, isActive, problemOf, type Job, type Problem } from "./api.ts";
 import { onSession } from "./session.ts";
 import { texts } from "./texts.ts";
@@ -10,6 +10,18 @@ export function useTitle(title: string): void {
   useEffect(() => {
     document.title = `${title} · ${texts.product}`;
   }, [title]);
+}
+
+/** True in a window as narrow as a phone's: where the style sheet's narrow rules hold. */
+export function useNarrow(): boolean {
+  const query = useMemo(() => matchMedia("(max-width: 46rem)"), []);
+  const [narrow, setNarrow] = useState(query.matches);
+  useEffect(() => {
+    const changed = () => setNarrow(query.matches);
+    query.addEventListener("change", changed);
+    return () => query.removeEventListener("change", changed);
+  }, []);
+  return narrow;
 }
 
 /** For data that is loaded once. */

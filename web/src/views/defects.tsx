@@ -2,7 +2,7 @@
 
 import { useEffect, useRef, useState } from "preact/hooks";
 import { defectsFile, getDefect, listAssets, listDefects, problemOf, type Defect, type DefectFilter, type Problem } from "../api.ts";
-import { once, useLoaded, useTitle } from "../hooks.ts";
+import { once, useLoaded, useNarrow, useTitle } from "../hooks.ts";
 import { CommandLine } from "../parts/command_line.tsx";
 import { DefectDialog } from "../parts/defect_dialog.tsx";
 import { DefectFilters } from "../parts/defect_filters.tsx";
@@ -18,7 +18,6 @@ const TYPING_MS = 250;
 /** Rows of the list with their gaps, px. */
 const ROW_PX = 76;
 const NARROW_ROW_PX = 146;
-const NARROW = matchMedia("(max-width: 46rem)");
 
 const NO_FILTER: DefectFilter = { q: "", asset: "", kind: "", severity: "", state: "", from_mm: "", to_mm: "", depth_min_mm: "", sort: "" };
 const NAMES = Object.keys(NO_FILTER) as (keyof DefectFilter)[];
@@ -203,14 +202,4 @@ function useDefects(filter: DefectFilter): Loaded {
   };
   const put = (defect: Defect) => setState((before) => ({ ...before, items: before.items?.map((each) => (each.id === defect.id ? defect : each)) ?? null }));
   return { items: state.items, more: state.cursor !== null, problem: state.problem, loadMore, reload: () => setTurn((n) => n + 1), put };
-}
-
-function useNarrow(): boolean {
-  const [narrow, setNarrow] = useState(NARROW.matches);
-  useEffect(() => {
-    const changed = () => setNarrow(NARROW.matches);
-    NARROW.addEventListener("change", changed);
-    return () => NARROW.removeEventListener("change", changed);
-  }, []);
-  return narrow;
 }

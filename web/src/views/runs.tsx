@@ -1,9 +1,9 @@
 // The list of runs: find one by its words, its state, its asset, its date; thousands of rows without lag. The address keeps what was asked for.
 
-import { useEffect, useMemo, useRef, useState } from "preact/hooks";
+import { useEffect, useRef, useState } from "preact/hooks";
 import { getRun, isActive, listAssets, listRuns, problemOf, productPath, type Problem, type Run, type RunFilter } from "../api.ts";
 import { lengthMm, size } from "../format.ts";
-import { once, useLoaded, useTitle } from "../hooks.ts";
+import { once, useLoaded, useNarrow, useTitle } from "../hooks.ts";
 import { CommandLine } from "../parts/command_line.tsx";
 import { dayStart } from "../parts/days.ts";
 import { farInWords, JobBar } from "../parts/job_bar.tsx";
@@ -178,17 +178,6 @@ async function refresh(filter: RunFilter, items: Run[], signal: AbortSignal, fou
   const kept = items.filter((run) => !gone(run)).map((run) => fresh.get(run.id) ?? run);
   const added = newestFirst ? head.items.filter(({ id }) => !items.some((run) => run.id === id)) : [];
   found([...added, ...kept]);
-}
-
-function useNarrow(): boolean {
-  const query = useMemo(() => matchMedia("(max-width: 46rem)"), []);
-  const [narrow, setNarrow] = useState(query.matches);
-  useEffect(() => {
-    const changed = () => setNarrow(query.matches);
-    query.addEventListener("change", changed);
-    return () => query.removeEventListener("change", changed);
-  }, []);
-  return narrow;
 }
 
 /** Below these shares somebody should look before trusting a map. */
