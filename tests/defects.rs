@@ -77,7 +77,7 @@ fn number(value: &Value, field: &str) -> f64 {
 
 fn damaged() -> &'static Made {
     static MADE: OnceLock<Made> = OnceLock::new();
-    MADE.get_or_init(|| Made::new("damaged", &["--seconds", "4", "--seed", "51"]))
+    MADE.get_or_init(|| Made::new("damaged", &["--seconds", "3.4", "--seed", "51"]))
 }
 
 #[test]
@@ -93,7 +93,8 @@ fn every_known_defect_is_found_with_its_kind_and_figures_and_nothing_else() {
         let found = defects.iter().min_by(|a, b| apart(a).total_cmp(&apart(b))).expect("some");
         assert!(apart(found) < 5.0, "{feature} is {} mm off: {found:#}", apart(found));
         let (depth, height) = (number(found, "depth_mm"), number(feature, "height"));
-        assert!((depth - height).abs() < f64::max(0.35, 0.1 * height.abs()), "{height} mm: {found:#}");
+        assert!((depth - height).abs() < f64::max(0.3, 0.1 * height.abs()), "{height} mm: {found:#}");
+        assert!((depth - height).abs() < 3.0 * number(found, "depth_sd_mm"), "{height} mm: {found:#}");
         let (kind, area) = match (feature["kind"].as_str(), height > 0.0) {
             (Some("bump"), dent) => {
                 (if dent { "dent" } else { "bulge" }, std::f64::consts::PI * number(feature, "r").powi(2))
@@ -113,9 +114,7 @@ fn every_known_defect_is_found_with_its_kind_and_figures_and_nothing_else() {
             }
         };
         assert_eq!(found["kind"], kind, "{found:#}");
-        // The smallest one is 20 mm in radius and 3 mm deep: the wall's own waves are a fifth of that.
-        let slack = if area < 2000.0 { 0.4 } else { 0.15 };
-        assert!((number(found, "area_mm2") / area - 1.0).abs() < slack, "{area} mm²: {found:#}");
+        assert!((number(found, "area_mm2") / area - 1.0).abs() < 0.15, "{area} mm²: {found:#}");
         assert!((number(found, "chainage_mm") - number(found, "x_mm") - 12000.0).abs() < 0.01);
         let code = match (kind, found["severity"].as_str()) {
             ("dent", Some("severe")) => "BAA A".into(),
@@ -140,7 +139,7 @@ fn foreign_programs_read_the_list_the_sections_and_the_residual_map() {
 #[test]
 fn a_sound_wall_gives_an_empty_list_also_under_a_gait() {
     for motion in ["wheels", "gait"] {
-        let made = Made::new("sound", &["--seconds", "3", "--seed", "31", "--motion", motion]);
+        let made = Made::new("sound", &["--seconds", "2.5", "--fps", "20", "--seed", "31", "--motion", motion]);
         let list = made.list();
         assert_eq!(made.defects(), Vec::<Value>::new(), "{motion}");
         let limit = number(&list, "detection_limit_mm");
@@ -153,7 +152,7 @@ fn a_sound_wall_gives_an_empty_list_also_under_a_gait() {
 #[test]
 fn a_pipe_s_radius_and_ovality_are_measured() {
     for (scene, ovality) in [("pipe-oval", 1.0), ("pipe-steady", 0.0)] {
-        let made = Made::new(scene, &["--seconds", "3", "--motion", "steady", "--seed", "42"]);
+        let made = Made::new(scene, &["--seconds", "2.5", "--fps", "20", "--motion", "steady", "--seed", "42"]);
         let reference = made.list()["reference"].clone();
         assert_eq!(reference["kind"], "cylinder");
         // From the arc alone, with what is said about how sure that is.
@@ -175,7 +174,7 @@ fn a_pipe_s_radius_and_ovality_are_measured() {
 #[test]
 fn two_runs_show_what_became_of_the_wall_and_nothing_else() {
     let run = |seed: &str, later: bool| {
-        let mut options = vec!["--seconds", "4", "--seed", seed, "--wall-seed", "7"];
+        let mut options = vec!["--seconds", "2.6", "--seed", seed, "--wall-seed", "7"];
         options.extend(later.then_some("--later"));
         Made::new("wall", &options)
     };
@@ -187,7 +186,7 @@ fn two_runs_show_what_became_of_the_wall_and_nothing_else() {
     };
     let same = changes(&first, &again);
     assert_eq!(same["changes"], Value::Array(Vec::new()), "the same wall, measured twice");
-    assert!(same["unchanged"].as_array().is_some_and(|all| all.len() > 5), "{same:#}");
+    assert!(same["unchanged"].as_array().is_some_and(|all| all.len() > 3), "{same:#}");
 
     let list = changes(&first, &later);
     let found = list["changes"].as_array().expect("changes");
@@ -209,7 +208,7 @@ fn two_runs_show_what_became_of_the_wall_and_nothing_else() {
         };
         let change = found.iter().find(near).unwrap_or_else(|| panic!("{feature} is not in {list:#}"));
         assert_eq!(change["state"], if delta == 2.0 { "grown" } else { "new" }, "{change:#}");
-        assert!((number(change, "delta_depth_mm") - delta).abs() < 0.8, "{delta} mm: {change:#}");
+        assert!((number(change, "delta_depth_mm") - delta).abs() < 0.4, "{delta} mm: {change:#}");
     }
 }
 

@@ -9,13 +9,14 @@ use serde::{Deserialize, Serialize};
 
 use super::background::{plate, refined, robust_plate, stiffness};
 use super::cells::Field;
-use super::measure::{Stretch, measure};
+use super::joint::measure_together;
+use super::measure::Stretch;
 use super::noise::Noise;
 use super::reference::Reference;
 use super::regions;
 use super::register::{Registration, register};
 use super::stretch::{self, COARSE, FIRST_LENGTH};
-use super::{CellGrid, Defect, DefectList, MARGIN_COLUMNS, ResidualStrip, SMOOTHING_CELLS};
+use super::{CellGrid, Defect, DefectList, MARGIN_COLUMNS, ResidualStrip, SMOOTHING_CELLS, Sampling};
 use crate::depth_map::MapReader;
 use crate::error::{Error, Result};
 use crate::recipe::DefectOptions;
@@ -73,6 +74,9 @@ pub struct Change {
     pub height_mm: Option<f64>,
     /// Greatest change along z, mm: above 0 away from the camera.
     pub delta_depth_mm: f64,
+    /// Its standard deviation, mm.
+    #[serde(default)]
+    pub delta_sd_mm: f64,
     /// Area of the change, mm².
     pub area_mm2: f64,
     /// Volume of the change, mm³.
@@ -169,13 +173,17 @@ pub fn compare(
     let mut found = Vec::new();
     let mut thresholds = Vec::new();
     let mut compared = 0_usize;
+    let sampling = Sampling {
+        profile_step_mm: before.list.profile_step_mm.max(after.list.profile_step_mm),
+        line_step_mm: before.list.line_step_mm.max(after.list.line_step_mm),
+    };
     for start in (0..grid.columns).step_by(CORE_COLUMNS) {
         let core = start..(start + CORE_COLUMNS).min(grid.columns);
         let columns = start.saturating_sub(MARGIN_COLUMNS)..(core.end + MARGIN_COLUMNS).min(grid.columns);
         let earlier = grid.read(before.residual, columns.start, columns.len())?;
         let later = registration.read(&grid, &columns, &other, after.residual)?;
-        let mut stretch = Difference::new(&grid, columns, &earlier, &later, before.list, registration.sd_mm(), options);
-        stretch.profile_step_mm = before.list.profile_step_mm.max(after.list.profile_step_mm);
+        let stretch =
+            Difference::new(&grid, columns, (&earlier, &later), before.list, sampling, registration.sd_mm(), options);
         take(&ResidualStrip {
             origin_mm: (grid.x0_mm, grid.y0_mm),
             cell_mm: grid.cell_mm,
@@ -210,8 +218,8 @@ struct Difference {
     search: Search,
     near_gap: Vec<bool>,
     wave_mm: f64,
-    /// The longer of both runs' ways between profiles, mm.
-    profile_step_mm: f64,
+    /// The sparser of both runs'.
+    sampling: Sampling,
 }
 
 /// The difference from a background, and what stands out of it.
@@ -259,17 +267,18 @@ impl Difference {
     fn new(
         grid: &CellGrid,
         columns: std::ops::Range<usize>,
-        earlier: &Field,
-        later: &Field,
+        (earlier, later): (&Field, &Field),
         list: &DefectList,
+        sampling: Sampling,
         sd_mm: f64,
         options: &DefectOptions,
     ) -> Difference {
         let mut raw = later.clone();
         raw.values.iter_mut().zip(&earlier.values).for_each(|(l, e)| *l -= e);
-        let untouched = stretch::near_gaps(&raw, stretch::GAP_CELLS);
+        let (gap, doubt) = stretch::gap_cells(&sampling, grid.cell_mm);
+        let untouched = stretch::near_gaps(&raw, gap);
         raw.values.iter_mut().zip(untouched).filter(|(_, near)| *near).for_each(|(v, _)| *v = f32::NAN);
-        let near_gap = stretch::near_gaps(&raw, stretch::DOUBT_CELLS);
+        let near_gap = stretch::near_gaps(&raw, doubt);
         let coarse = raw.shrunk(COARSE, stretch::COARSE_SHARE);
         let wave_mm = list.reference.wave_mm;
         let wave_cells = wave_mm / (grid.cell_mm * COARSE as f64);
@@ -283,7 +292,7 @@ impl Difference {
             background = plate(&coarse, &weights, stiffness(wave_cells));
             search = Search::against(&raw, &background, &slopes, sd_mm, options, Some(&masked));
         }
-        Difference { columns, search, near_gap, wave_mm, profile_step_mm: 0.0 }
+        Difference { columns, search, near_gap, wave_mm, sampling }
     }
 
     fn core(&self, core: &std::ops::Range<usize>) -> Vec<f32> {
@@ -309,25 +318,23 @@ impl Difference {
         self.search.regions.iter().flat_map(|region| &region.cells).for_each(|cell| taken[*cell] = true);
         let reference = Reference::flat();
         let (x_from, x_to) = (grid.x_mm(core.start as f64 - 0.5), grid.x_mm(core.end as f64 - 0.5));
-        let found = self.search.regions.iter().filter_map(|region| {
+        let stretch = Stretch {
+            grid,
+            first_column: self.columns.start,
+            reference: &reference,
+            deviation: &self.search.off,
+            smooth: &self.search.smooth,
+            near_gap: &self.near_gap,
+            thresholds_mm: &self.search.thresholds_mm,
+            noise_mm: &self.search.noise.rows_mm,
+            taken: &taken,
+            wave_mm: self.wave_mm,
             // On a slope the threshold is higher.
-            let slack = self.search.slack[region.summit];
-            let thresholds_mm: Vec<f32> = self.search.thresholds_mm.iter().map(|t| t * slack).collect();
-            let stretch = Stretch {
-                grid,
-                first_column: self.columns.start,
-                reference: &reference,
-                deviation: &self.search.off,
-                smooth: &self.search.smooth,
-                near_gap: &self.near_gap,
-                thresholds_mm: &thresholds_mm,
-                noise_mm: &self.search.noise.rows_mm,
-                taken: &taken,
-                wave_mm: self.wave_mm,
-                profile_step_mm: self.profile_step_mm,
-            };
-            measure(&stretch, region, options)
-        });
+            slack: Some(&self.search.slack),
+            blur: stretch::blur(&self.sampling, grid.cell_mm),
+            profile_step_mm: self.sampling.profile_step_mm,
+        };
+        let found = measure_together(&stretch, &self.search.regions, options, false).defects.into_iter();
         found.filter(|d| d.x_mm >= x_from && d.x_mm < x_to).collect()
     }
 }
@@ -393,6 +400,7 @@ fn identify(
                 clock_h: named.and_then(|d| d.clock_h),
                 height_mm: (before.reference.radius_mm.is_none()).then_some(-change.y_mm),
                 delta_depth_mm: change.depth_mm,
+                delta_sd_mm: change.depth_sd_mm,
                 area_mm2: change.area_mm2,
                 volume_mm3: change.volume_mm3,
                 confidence: change.confidence,

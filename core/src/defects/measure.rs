@@ -5,6 +5,7 @@ use std::collections::HashSet;
 use nalgebra::{Matrix2, SMatrix, SVector, Vector2};
 
 use super::cells::{CellGrid, Field};
+use super::form::Blur;
 use super::reference::{Reference, Shape};
 use super::regions::Region;
 use super::{Bounds, Defect, DefectKind, SMOOTHING_CELLS};
@@ -24,7 +25,7 @@ const LEAST_FLAT_CELLS: usize = 30;
 const LEAST_SUPPORT: f64 = 0.5;
 const LEAST_DISC: f64 = 1.5;
 /// A region is longer than the travel between so many profiles: a single one that is wrong makes one as long as 1.
-const PROFILES: f64 = 1.35;
+pub(super) const PROFILES: f64 = 1.35;
 /// The rim in extents at half height, a little beyond; how much wider the ring about it is, and by how many cells.
 const RIM: f64 = 1.15;
 const RING: f64 = 1.3;
@@ -37,10 +38,13 @@ const REACH: f64 = 1.2;
 const BODY_LEVEL: f32 = 0.2;
 /// Level down to which the volume is summed: below it lies the surroundings' own scatter.
 const VOLUME_LEVEL: f32 = 0.05;
+/// Share of a depth that is unsure where no form was fitted: the summit of what is neither round nor flat.
+const ROUGH_SD: f64 = 0.05;
 /// Level that gives the extents.
 const EXTENT_LEVEL: f32 = 0.3;
 
 /// A stretch of the surface with its deviation from the undamaged shape.
+#[derive(Clone, Copy)]
 pub(super) struct Stretch<'a> {
     pub grid: &'a CellGrid,
     /// The stretch's first column on the grid.
@@ -60,8 +64,27 @@ pub(super) struct Stretch<'a> {
     pub taken: &'a [bool],
     /// Waves longer than this are in the background already, mm.
     pub wave_mm: f64,
+    /// How many times higher than its row's a cell's threshold is, where cells differ.
+    pub slack: Option<&'a [f32]>,
+    /// What blurred the surface when it was measured.
+    pub blur: Blur,
     /// Travel from one profile to the next, mm; 0 where it is not known.
     pub profile_step_mm: f64,
+}
+
+impl Stretch<'_> {
+    pub(super) fn slack(&self, cell: usize) -> f32 {
+        self.slack.map_or(1.0, |slack| slack[cell])
+    }
+
+    fn threshold_mm(&self, cell: usize) -> f32 {
+        self.thresholds_mm[cell / self.smooth.columns] * self.slack(cell)
+    }
+}
+
+/// A region of no more cells is too small to be listed.
+pub(super) fn least_cells(options: &DefectOptions, cell_mm: f64) -> usize {
+    (std::f64::consts::PI * (0.5 * options.radius_min_mm / cell_mm).powi(2)) as usize
 }
 
 /// A region above the surface about it: what the background left of a wave is taken off.
@@ -113,7 +136,7 @@ pub(super) fn measure(stretch: &Stretch, region: &Region, options: &DefectOption
         relief.level = surroundings(&relief, half);
     }
     let rough = relief.height(region.summit);
-    let threshold = stretch.thresholds_mm[region.summit / columns];
+    let threshold = stretch.threshold_mm(region.summit);
     if rough < 0.8 * threshold {
         return None;
     }
@@ -170,6 +193,7 @@ pub(super) fn measure(stretch: &Stretch, region: &Region, options: &DefectOption
         clock_h: None,
         height_mm: None,
         depth_mm: signed,
+        depth_sd_mm: f64::from(noise_mm).hypot(ROUGH_SD * signed),
         depth_normal_mm: signed * facing,
         length_mm,
         width_mm,
@@ -199,7 +223,7 @@ fn believed(relief: &Relief, options: &DefectOptions) -> bool {
     let upper: Vec<usize> = relief.above(0.5 * rough).collect();
     let firm = |cell: &&usize| stretch.deviation.values[**cell].is_finite() && !stretch.near_gap[**cell];
     let firm: Vec<usize> = upper.iter().filter(firm).copied().collect();
-    let threshold = stretch.thresholds_mm[relief.region.summit / relief.columns];
+    let threshold = stretch.threshold_mm(relief.region.summit);
     let alone = firm.iter().filter(|c| relief.height(**c) > threshold).count() as f64;
     let cell_mm = stretch.grid.cell_mm;
     let disc_cells = std::f64::consts::PI * (LEAST_DISC * options.radius_min_mm / cell_mm).powi(2);

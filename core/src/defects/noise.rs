@@ -66,8 +66,9 @@ impl Noise {
 }
 
 /// The depth of round dents that just reach a threshold: what smoothing and the background take from them included.
-/// `rounds` gives (threshold in mm, length that the background follows in mm) of each search; the best one counts.
-pub(super) fn limits(rounds: &[(f64, f64)], cell_mm: f64) -> Vec<DetectionLimit> {
+/// `rounds` gives (threshold in mm, length that the background follows in mm) of each search; the best one counts. Dents of
+/// a radius up to `too_short_mm` are not listed however deep they are: they have no limit.
+pub(super) fn limits(rounds: &[(f64, f64)], cell_mm: f64, too_short_mm: f64) -> Vec<DetectionLimit> {
     let limit = |radius_mm: f64| {
         let seen = rounds.iter().map(|(threshold_mm, follows_mm)| {
             let left = peak_left(radius_mm, f64::from(SMOOTHING_CELLS) * cell_mm);
@@ -77,7 +78,8 @@ pub(super) fn limits(rounds: &[(f64, f64)], cell_mm: f64) -> Vec<DetectionLimit>
         });
         seen.fold(f64::INFINITY, f64::min)
     };
-    RADII_MM.iter().map(|r| DetectionLimit { radius_mm: *r, depth_mm: limit(*r) }).collect()
+    let seen = RADII_MM.into_iter().filter(|radius_mm| *radius_mm > too_short_mm);
+    seen.map(|radius_mm| DetectionLimit { radius_mm, depth_mm: limit(radius_mm) }).collect()
 }
 
 /// What a Gaussian of `sigma_mm` leaves of the depth of a dent with the form of a raised cosine.
@@ -112,9 +114,11 @@ mod tests {
 
     #[test]
     fn small_dents_must_be_deeper_to_be_seen() {
-        let limits = limits(&[(0.5, 400.0)], 1.0);
+        let limits = limits(&[(0.5, 400.0)], 1.0, 4.0);
         let depth = |radius: f64| limits.iter().find(|l| l.radius_mm == radius).map(|l| l.depth_mm).expect("listed");
         assert!(depth(5.0) > 1.2 * depth(20.0), "{limits:?}");
         assert!((depth(40.0) - 0.5).abs() < 0.1 && depth(160.0) > 0.6, "{limits:?}");
+        let sparse = super::limits(&[(0.5, 400.0)], 1.0, 22.0);
+        assert_eq!(sparse.first().map(|l| l.radius_mm), Some(40.0), "what lies between two profiles is not promised");
     }
 }

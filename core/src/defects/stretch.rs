@@ -5,12 +5,14 @@
 
 use super::background::{plate, refined, robust_plate, stiffness};
 use super::cells::{CellGrid, Field};
-use super::measure::{Stretch, measure};
+use super::form::Blur;
+use super::joint::{Measured, measure_together};
+use super::measure::{Stretch, least_cells};
 use super::noise::Noise;
 use super::reference::{Place, Reference, Shape, fit};
 use super::regions::{self, Region};
 use super::section::Station;
-use super::{Defect, SMOOTHING_CELLS, SectionRow};
+use super::{Defect, SMOOTHING_CELLS, Sampling, SectionRow};
 use crate::recipe::DefectOptions;
 
 /// Fine cells to a side of a coarse one, on which the background is fitted.
@@ -23,12 +25,17 @@ pub(super) const FIRST_LENGTH: f64 = 4.0;
 pub(super) const ROUNDS: usize = 2;
 /// Widest gap that a region may continue over, mm.
 const BRIDGE_MM: f64 = 25.0;
-/// Cells beside a gap that are not searched: what makes a gap, such as a highlight, disturbs its neighbours; and further
-/// ones on which alone no defect is believed.
-pub(super) const GAP_CELLS: usize = 2;
-pub(super) const DOUBT_CELLS: usize = 3;
+/// Cells beside a gap that are not searched, and as many image rows at least: what makes a gap, such as a highlight,
+/// disturbs its neighbours; and further ones on which alone no defect is believed.
+const GAP_CELLS: usize = 2;
+const GAP_ROWS: f64 = 4.0;
+const DOUBT_CELLS: usize = 3;
+const DOUBT_ROWS: f64 = 6.0;
 /// Least of the smoothing's weight that must be measured.
 pub(super) const SMOOTH_SHARE: f32 = 0.3;
+/// Standard deviation of a laser line's width, and of the smoothing along it where it bends, in rows; from simulated runs.
+const LINE_WIDTH_ROWS: f64 = 1.7;
+const LINE_SMOOTHING_ROWS: f64 = 2.5;
 /// Least scatter of coarse cells that is believed, mm.
 pub(super) const LEAST_SCATTER_MM: f32 = 0.03;
 
@@ -39,8 +46,7 @@ pub(super) struct Task<'a> {
     pub shape: Shape,
     /// Length of the waves that belong to the undamaged surface, mm.
     pub wave_mm: f64,
-    /// Travel from one profile to the next, mm; 0 where it is not known.
-    pub profile_step_mm: f64,
+    pub sampling: Sampling,
     /// The columns that are read, and the part of them that this stretch answers for.
     pub columns: std::ops::Range<usize>,
     pub core: std::ops::Range<usize>,
@@ -81,12 +87,13 @@ pub(super) fn examine(task: &Task, depth: &Field) -> Option<Examined> {
     let (grid, options) = (task.grid, task.options);
     let reference = fit(task.shape, &places(task, depth))?;
     let mut deviation = deviation(task, &reference, depth);
-    let untouched = near_gaps(&deviation, GAP_CELLS);
+    let (gap, doubt) = gap_cells(&task.sampling, grid.cell_mm);
+    let untouched = near_gaps(&deviation, gap);
     deviation.values.iter_mut().zip(untouched).filter(|(_, near)| *near).for_each(|(v, _)| *v = f32::NAN);
     let coarse = deviation.shrunk(COARSE, COARSE_SHARE);
     let wave_cells = task.wave_mm / (grid.cell_mm * COARSE as f64);
     let mut background = robust_plate(&coarse, stiffness(FIRST_LENGTH * wave_cells), LEAST_SCATTER_MM);
-    let gaps = near_gaps(&deviation, GAP_CELLS + DOUBT_CELLS);
+    let gaps = near_gaps(&deviation, gap + doubt);
     let mut search = Search::of(task, &deviation, &background, None);
     let first = Threshold::of(&search.thresholds_mm);
     for _ in 0..ROUNDS {
@@ -110,16 +117,17 @@ pub(super) fn examine(task: &Task, depth: &Field) -> Option<Examined> {
         noise_mm: &noise.rows_mm,
         taken: &taken,
         wave_mm: task.wave_mm,
-        profile_step_mm: task.profile_step_mm,
+        slack: None,
+        blur: blur(&task.sampling, grid.cell_mm),
+        profile_step_mm: task.sampling.profile_step_mm,
     };
-    let measured: Vec<Option<Defect>> = regions.iter().map(|region| measure(&stretch, region, options)).collect();
-    let doubtful = measured.iter().filter(|m| m.is_none()).count();
+    let Measured { defects, doubtful } = measure_together(&stretch, &regions, options, true);
     let (x_from, x_to) = (grid.x_mm(task.core.start as f64 - 0.5), grid.x_mm(task.core.end as f64 - 0.5));
     let slack_mm = 3.0 * grid.cell_mm;
     let mine = |d: &Defect| d.x_mm >= x_from - slack_mm && d.x_mm <= x_to + slack_mm;
     let last = Threshold::of(&thresholds_mm);
     Some(Examined {
-        defects: measured.into_iter().flatten().filter(mine).map(|d| placed(d, &reference, options)).collect(),
+        defects: defects.into_iter().filter(mine).map(|d| placed(d, &reference, options)).collect(),
         doubtful,
         sections: sections(task, depth, &off, &smooth, &free, &reference),
         residual: core_of(task, &off),
@@ -152,11 +160,26 @@ impl Search {
         let threshold = |sigma: &f32| (options.noise_factor as f32 * sigma).max(options.depth_min_mm as f32);
         let thresholds_mm: Vec<f32> = noise.rows_mm.iter().map(threshold).collect();
         bridge(&mut smooth, (BRIDGE_MM / task.grid.cell_mm) as usize);
-        let least_cells = (std::f64::consts::PI * (0.5 * options.radius_min_mm / task.grid.cell_mm).powi(2)) as usize;
+        let least = least_cells(options, task.grid.cell_mm);
         let mut regions = regions::find(&smooth, &thresholds_mm);
-        regions.retain(|region| region.cells.len() > least_cells);
+        regions.retain(|region| region.cells.len() > least);
         Search { off, smooth, noise, thresholds_mm, regions, free }
     }
+}
+
+/// Cells beside a gap that are not searched, and that are doubted.
+pub(super) fn gap_cells(sampling: &Sampling, cell_mm: f64) -> (usize, usize) {
+    let rows = |rows: f64| (rows * sampling.line_step_mm / cell_mm).round() as usize;
+    (GAP_CELLS.max(rows(GAP_ROWS)), DOUBT_CELLS.max(rows(DOUBT_ROWS)))
+}
+
+/// What blurs the surface on its way into the map, in cells along columns and rows.
+pub(super) fn blur(sampling: &Sampling, cell_mm: f64) -> Blur {
+    // The mean over a cell; between two profiles the surface is taken to be straight; the line has a width.
+    let cell = cell_mm * cell_mm / 12.0;
+    let along = sampling.profile_step_mm.powi(2) / 6.0 + (LINE_WIDTH_ROWS * sampling.line_step_mm).powi(2) + cell;
+    let across = (LINE_SMOOTHING_ROWS * sampling.line_step_mm).powi(2) + cell;
+    (along.sqrt() / cell_mm, across.sqrt() / cell_mm)
 }
 
 /// Cells that were measured and lie in no masked coarse cell.

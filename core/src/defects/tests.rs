@@ -29,9 +29,12 @@ fn map(width_px: usize, base: impl Fn(f64, f64) -> f64, bumps: &[Bump], hole: im
     })
 }
 
+/// The maps of these tests are not blurred.
+const SAMPLING: Sampling = Sampling { profile_step_mm: 0.1, line_step_mm: 0.0 };
+
 fn found(map: &mut GridMap) -> Findings {
     let recipe = Recipe::default();
-    find(map, &recipe.defects, Chainage { start_mm: 1000.0, falls: false }, 5.0, &mut |_| Ok(()))
+    find(map, &recipe.defects, Chainage { start_mm: 1000.0, falls: false }, SAMPLING, &mut |_| Ok(()))
         .expect("find")
         .expect("measured")
 }
@@ -103,5 +106,22 @@ fn blocks_and_pits_with_steep_sides_have_their_own_names() {
         assert_eq!(defect.kind, kind, "{defect:#?}");
         assert!((defect.depth_mm / height - 1.0).abs() < 0.1, "{defect:#?}");
         assert!((defect.area_mm2 / 5000.0 - 1.0).abs() < 0.1 && (defect.length_mm - 100.0).abs() < 6.0, "{defect:#?}");
+    }
+}
+
+#[test]
+fn a_dent_in_another_s_footprint_is_told_apart_and_neither_spoils_the_other() {
+    let bumps =
+        [(400.0, 0.0, 90.0, 14.0), (462.0, 10.0, 26.0, -4.5), (700.0, 60.0, 45.0, -8.0), (768.0, 90.0, 40.0, 6.0)];
+    let found = found(&mut map(1200, wall, &bumps, |_, _| false));
+    assert_eq!(found.list.defects.len(), bumps.len(), "{:#?}", found.list.defects);
+    for (x, y, radius, height) in bumps {
+        let apart = |d: &&Defect| (d.x_mm - x).hypot(d.y_mm - y);
+        let defect = found.list.defects.iter().min_by(|a, b| apart(a).total_cmp(&apart(b))).expect("some");
+        assert!(apart(&defect) < 3.0, "({x}, {y}): {defect:#?}");
+        assert!((defect.depth_mm - height).abs() < f64::max(0.3, 0.1 * height.abs()), "{height} mm: {defect:#?}");
+        let area_mm2 = std::f64::consts::PI * radius * radius;
+        assert!((defect.area_mm2 / area_mm2 - 1.0).abs() < 0.15, "{area_mm2} mm²: {defect:#?}");
+        assert!((defect.depth_mm - height).abs() < 3.0 * defect.depth_sd_mm, "{height} mm: {defect:#?}");
     }
 }

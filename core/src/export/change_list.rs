@@ -19,7 +19,7 @@ pub const MAP_NAME: &str = "difference.tif";
 
 /// The first line of the table.
 pub const HEADER: &str = "id,state,chainage_mm,clock_h,height_mm,x_mm,y_mm,delta_depth_mm,area_mm2,volume_mm3,confidence,\
-                          before_id,before_depth_mm,after_id,after_depth_mm";
+                          before_id,before_depth_mm,after_id,after_depth_mm,delta_sd_mm";
 
 /// Compares two product folders and writes the three files into `out`, which must exist.
 ///
@@ -72,6 +72,7 @@ fn write(list: &ChangeList, folder: &Path) -> Result<()> {
         line.push(',');
         line.push_str(&id(change.after_id));
         push(&mut line, change.after_depth_mm, 3);
+        push(&mut line, Some(change.delta_sd_mm), 3);
         line.push('\n');
         table.push_str(&line);
     }

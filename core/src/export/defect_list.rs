@@ -15,7 +15,7 @@ pub const CSV_NAME: &str = "defects.csv";
 /// The first line of the table.
 pub const HEADER: &str = "id,kind,severity,code,chainage_mm,clock_h,height_mm,x_mm,y_mm,z_mm,depth_mm,depth_normal_mm,\
                           length_mm,width_mm,area_mm2,surface_area_mm2,volume_mm3,steepest_slope_deg,confidence,noise_mm,\
-                          measured_share,at_edge,deepest_x_mm,deepest_y_mm";
+                          measured_share,at_edge,deepest_x_mm,deepest_y_mm,depth_sd_mm";
 
 /// Writes both files into a product folder.
 pub fn write(list: &DefectList, folder: &Path) -> Result<()> {
@@ -100,6 +100,7 @@ fn line(d: &Defect) -> String {
     let _ = write!(line, ",{}", d.at_edge);
     push(&mut line, Some(d.deepest_x_mm), 2);
     push(&mut line, Some(d.deepest_y_mm), 2);
+    push(&mut line, Some(d.depth_sd_mm), 3);
     line.push('\n');
     line
 }

@@ -8,7 +8,7 @@ use super::laz::LazThread;
 use super::progress::Progress;
 use super::quality::QualityCounter;
 use super::{Cargo, Colours, Event, Newest, ProductGroup, Request, Timings};
-use crate::defects::{self, Chainage, Findings};
+use crate::defects::{self, Chainage, Findings, Sampling};
 use crate::depth_map::sheet::Sheet;
 use crate::depth_map::strips::{add_strip, strip_grid};
 use crate::depth_map::{FinishedMap, Grid, MapReader, SharedMap, SurfaceMap};
@@ -294,9 +294,12 @@ impl<'a> Products<'a> {
         let (quality, gaps, resolution) = quality.finish(&request.rig, coverage);
         let given = request.track_use(self.beside);
         warn_of_quality(&quality, &gaps, request, given, progress)?;
-        let profile_step_mm = resolution.and_then(|r| r.r_lateral_mm).unwrap_or(0.0);
+        let sampling = resolution.map_or_else(Sampling::default, |r| Sampling {
+            profile_step_mm: r.r_lateral_mm.unwrap_or(0.0),
+            line_step_mm: r.r_vertical_mm,
+        });
         let Maps { gray, picture, found } =
-            timings.time("maps", || self.write_maps(finished.as_mut(), profile_step_mm, progress))?;
+            timings.time("maps", || self.write_maps(finished.as_mut(), sampling, progress))?;
         if let Some((_, time)) = &found {
             timings.add("defects", *time);
         }
@@ -386,7 +389,7 @@ impl<'a> Products<'a> {
     fn write_maps(
         &mut self,
         map: Option<&mut FinishedMap<'_>>,
-        profile_step_mm: f64,
+        sampling: Sampling,
         progress: &mut Progress<'_, '_>,
     ) -> Result<Maps> {
         let Some(map) = map else { return Ok(Maps::default()) };
@@ -397,9 +400,8 @@ impl<'a> Products<'a> {
         let (options, chainage) = (&self.request.recipe.defects, self.request.chainage);
         let shared = SharedMap::new(map);
         std::thread::scope(|scope| {
-            let searching = (wants(ProductGroup::Defects) || wants(ProductGroup::Report)).then(|| {
-                scope.spawn(|| find_defects(&mut shared.reader(), options, chainage, profile_step_mm, folder))
-            });
+            let searching = (wants(ProductGroup::Defects) || wants(ProductGroup::Report))
+                .then(|| scope.spawn(|| find_defects(&mut shared.reader(), options, chainage, sampling, folder)));
             let beside = scope.spawn(|| -> Result<Option<Picture>> {
                 if wants(ProductGroup::Depth) {
                     depth_tif::write(&mut shared.reader(), &folder.join("depth.tif"))?;
@@ -493,12 +495,12 @@ fn find_defects(
     map: &mut dyn MapReader,
     options: &DefectOptions,
     chainage: Chainage,
-    profile_step_mm: f64,
+    sampling: Sampling,
     folder: &Path,
 ) -> Result<Option<(Findings, Duration)>> {
     let start = Instant::now();
     let mut residual = ResidualWriter::new(folder, residual_tif::NAME);
-    let found = defects::find(map, options, chainage, profile_step_mm, &mut |strip| residual.push(strip))?;
+    let found = defects::find(map, options, chainage, sampling, &mut |strip| residual.push(strip))?;
     let Some(mut findings) = found else { return Ok(None) };
     let codes = Codes::parse(&options.codes)
         .map_err(|(found, expected)| Error::field("recipe", "defects.codes", found, expected))?;

@@ -7,6 +7,9 @@ use super::drawings;
 use super::pictures::{Placed, Views};
 use crate::defects::{Defect, DefectKind, DefectList};
 
+/// An ovality of fewer standard deviations is not told from none.
+const TOLD_APART_SDS: f64 = 2.0;
+
 const STYLE: &str = include_str!("style.css");
 
 /// Everything above the overview.
@@ -43,7 +46,10 @@ pub(super) fn head(page: &mut String, run: &ReportRun, list: &DefectList) {
         ("Found", found(list)),
         (
             "Detection limit",
-            format!("{:.2} mm for a round dent of 20 mm radius (see Method and limits)", list.detection_limit_mm),
+            format!(
+                "{:.2} mm for a round dent of {:.0} mm radius (see Method and limits)",
+                list.detection_limit_mm, list.detection_limit_radius_mm
+            ),
         ),
     ];
     page.push_str("<dl class=\"facts\">");
@@ -68,6 +74,10 @@ fn reference(list: &DefectList) -> String {
             sd.unwrap_or(0.0),
             shape.seen_from.as_deref().unwrap_or("one side"),
             match (shape.ovality_percent, shape.ovality_sd_percent) {
+                (Some(ovality), Some(sd)) if ovality.abs() < TOLD_APART_SDS * sd => format!(
+                    "not told from a round pipe: {:.2} % with a standard deviation of {sd:.2} % from the arc that was seen",
+                    ovality.abs()
+                ),
                 (Some(ovality), Some(sd)) => format!("{:.2} % (standard deviation {sd:.2} %)", ovality.abs()),
                 _ => "not determined".into(),
             }
@@ -144,13 +154,14 @@ fn position(d: &Defect) -> String {
 pub(super) fn block(page: &mut String, d: &Defect, views: &Views) {
     let _ = write!(
         page,
-        "<section class=\"defect\" id=\"d{}\"><h3>{} · {} · {:+.2} mm</h3><p>Chainage {:.3} m, {} {}; {:.0} × {:.0} mm, area \
+        "<section class=\"defect\" id=\"d{}\"><h3>{} · {} · {:+.2} mm</h3><p>Depth ± {:.2} mm. Chainage {:.3} m, {} {}; {:.0} × {:.0} mm, area \
          {:.0} mm², volume {:.0} mm³, steepest slope {:.0}°, {:+.2} mm square to the surface. Scatter of the surface beside it \
          {:.2} mm, {:.0} % of it measured, {:.0} % sure{}.</p><div class=\"views\">",
         d.id,
         d.id,
         d.kind.name().replace('_', " "),
         d.depth_mm,
+        d.depth_sd_mm,
         d.chainage_mm / 1000.0,
         if d.clock_h.is_some() { "clock" } else { "height (mm)" },
         position(d),

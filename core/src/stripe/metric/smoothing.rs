@@ -176,7 +176,8 @@ fn as_smooth_as_true(stiff: &[(f32, f32)], supple: &[(f32, f32)]) -> Vec<(f32, f
             let mean = (sums[to] - sums[from]) / (to - from) as f32;
             // A highlight's line would bend anyhow: there a spot knows little.
             let sure = 1.0 / (1.0 + (ALIKE * ALIKE * supple[i].1 / (UNSURE_PX * UNSURE_PX)).powi(2));
-            let share = sure * (1.0 - BY_CHANCE / mean.max(1e-6)).max(0.0);
+            // Where it is hardly chance, nearly all of it is the wall's: what is held back is missing from every dent's depth.
+            let share = sure * (1.0 - (BY_CHANCE / mean.max(1e-6)).powi(2)).max(0.0);
             let between = |a: f32, b: f32| a + share * (b - a);
             (between(stiff[i].0, supple[i].0), between(stiff[i].1, supple[i].1))
         })
