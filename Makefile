@@ -1,5 +1,5 @@
 # Everything a person does with Stria's sources. `make demo` and `make test` need only Debian 12, Rust, Node and make.
-.PHONY: demo test bench bench-exports bench-live bench-upload bench-queue check setup web build
+.PHONY: demo test bench bench-defects bench-exports bench-live bench-queue bench-upload check setup web build
 
 # Sets up, builds, makes a realistic run, processes it through the server and says which URL to open.
 demo: build
@@ -33,6 +33,10 @@ bench-queue: build
 	cd tests/bench/queue && npm ci --no-audit --no-fund
 	target/python/bin/python tests/bench/queue.py
 	cargo test --release --locked --workspace --bin stria -- --ignored --nocapture scale
+
+# Defects, sections and change between runs against the truth; DEFECTS="--quick" for three scenes.
+bench-defects: build
+	target/python/bin/python tests/bench/defects.py $(DEFECTS)
 
 # Format, lints and docs as errors.
 check: setup web

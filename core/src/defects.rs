@@ -38,7 +38,7 @@ use crate::error::Result;
 use crate::recipe::DefectOptions;
 use cells::{CellGrid, Field};
 use gathered::Gathered;
-use reference::{Place, Shape, choose};
+use reference::{Place, choose};
 use stretch::{COARSE, Task, examine};
 
 pub use list::{

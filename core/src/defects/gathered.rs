@@ -1,13 +1,13 @@
 //! What the stretches show, put together to the run's list and sections.
 
 use super::cells::CellGrid;
-use super::list::LIMIT_RADIUS_MM;
+use super::list::{LIMIT_RADIUS_MM, least_radius_mm};
 use super::reference::{self, Shape};
 use super::section::pooled;
 use super::stretch::{Examined, FIRST_LENGTH, Threshold};
 use super::{
     Chainage, Defect, DefectList, DetectionLimit, Findings, Inspected, ReferenceShape, SCHEMA_VERSION, Sampling,
-    SectionRow, measure, noise,
+    SectionRow, noise,
 };
 use crate::recipe::DefectOptions;
 
@@ -117,7 +117,7 @@ impl Gathered {
         let worst = |pick: fn(&Seen) -> f64| matter().map(pick).fold(0.0, f64::max);
         let limits = |first: f64, last: f64| {
             let rounds = [(first, FIRST_LENGTH * wave_mm), (last, wave_mm)];
-            noise::limits(&rounds, grid.cell_mm, measure::PROFILES * sampling.profile_step_mm)
+            noise::limits(&rounds, grid.cell_mm, least_radius_mm(sampling.profile_step_mm))
         };
         (
             limits(worst(|s| s.first.typical_mm), worst(|s| s.last.typical_mm)),

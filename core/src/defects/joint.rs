@@ -36,8 +36,9 @@ const UNLIKE: f32 = 0.15;
 const HIDDEN_CELLS: usize = 4;
 /// Cells about a region without a form that its neighbours do not look at.
 const APART_CELLS: usize = 2;
-/// Share of a form's height that its smoothing, the slow waves under it and the scale leave unsure besides the scatter.
+/// Share of a form's height that the scale leaves unsure besides the scatter, and share of what the blur takes from it.
 const SCALE_SD: f64 = 0.02;
+const BLUR_SD: f64 = 0.3;
 
 /// The defects of a stretch.
 pub(super) struct Measured {
@@ -268,7 +269,9 @@ fn describe(defect: &mut Defect, fit: &Fit, stretch: &Stretch) {
     defect.z_mm = stretch.reference.z_mm(x_mm, y_mm) + form.height_mm;
     defect.depth_mm = form.height_mm;
     defect.depth_normal_mm = form.height_mm * facing;
-    defect.depth_sd_mm = fit.height_sd_mm.hypot(defect.noise_mm).hypot(SCALE_SD * form.height_mm);
+    let blurred_mm = form.height_mm - form.summit_mm(stretch.blur);
+    let formal_mm = fit.height_sd_mm.hypot(defect.noise_mm);
+    defect.depth_sd_mm = formal_mm.hypot(SCALE_SD * form.height_mm).hypot(BLUR_SD * blurred_mm);
     defect.length_mm = length_mm;
     defect.width_mm = width_mm;
     defect.area_mm2 = form.area_cells() * cell_mm * cell_mm;

@@ -12,6 +12,14 @@ fn limit_radius_mm() -> f64 {
     LIMIT_RADIUS_MM
 }
 
+/// A region is longer than the travel between so many profiles: a single one that is wrong makes one as long as 1.
+pub(super) const LEAST_PROFILES: f64 = 1.35;
+
+/// Radius of the least dent that is longer than that at half of its depth, mm.
+pub(super) fn least_radius_mm(profile_step_mm: f64) -> f64 {
+    LEAST_PROFILES * profile_step_mm
+}
+
 /// What kind of departure a defect is.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Hash, Serialize, Deserialize)]
 #[serde(rename_all = "snake_case")]
@@ -237,4 +245,11 @@ pub struct DefectList {
     pub omitted: usize,
     /// The defects, in the order of the chainage.
     pub defects: Vec<Defect>,
+}
+
+impl DefectList {
+    /// Dents of a lesser radius might be a single wrong profile and are not listed, mm.
+    pub fn least_radius_mm(&self) -> f64 {
+        least_radius_mm(self.profile_step_mm)
+    }
 }

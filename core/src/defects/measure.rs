@@ -6,6 +6,7 @@ use nalgebra::{Matrix2, SMatrix, SVector, Vector2};
 
 use super::cells::{CellGrid, Field};
 use super::form::Blur;
+use super::list::least_radius_mm;
 use super::reference::{Reference, Shape};
 use super::regions::Region;
 use super::{Bounds, Defect, DefectKind, SMOOTHING_CELLS};
@@ -24,8 +25,6 @@ const LEAST_FLAT_CELLS: usize = 30;
 /// of it must reach the threshold there, in least radii.
 const LEAST_SUPPORT: f64 = 0.5;
 const LEAST_DISC: f64 = 1.5;
-/// A region is longer than the travel between so many profiles: a single one that is wrong makes one as long as 1.
-pub(super) const PROFILES: f64 = 1.35;
 /// The rim in extents at half height, a little beyond; how much wider the ring about it is, and by how many cells.
 const RIM: f64 = 1.15;
 const RING: f64 = 1.3;
@@ -229,7 +228,7 @@ fn believed(relief: &Relief, options: &DefectOptions) -> bool {
     let disc_cells = std::f64::consts::PI * (LEAST_DISC * options.radius_min_mm / cell_mm).powi(2);
     let supported = firm.len() as f64 >= LEAST_SUPPORT * upper.len() as f64 || alone >= disc_cells;
     let length = extents(upper.iter().copied(), relief.columns).map_or(0.0, |across| across.0 as f64 * cell_mm);
-    supported && length > PROFILES * stretch.profile_step_mm
+    supported && length > least_radius_mm(stretch.profile_step_mm)
 }
 
 /// The plane of what lies about a region and belongs to none: its value at the summit and its slopes.

@@ -204,13 +204,14 @@ pub(super) fn method(page: &mut String, run: &ReportRun, list: &DefectList) {
         "<h2>Method and limits</h2><p>A line laser and a camera (method <em>{}</em>) measured the surface; {} was fitted to it, \
          and what departs from that shape by more than the scatter beside it is listed. Waves longer than {:.0} mm count as \
          the undamaged surface. The surface was searched in cells of {:.1} mm; it scatters by {:.3} mm (one standard deviation). \
-         Profiles lie {:.1} mm apart: what only one of them shows is not listed.</p>",
+         Profiles lie {:.1} mm apart: what only one of them shows is not listed, nor a dent of less than {:.0} mm radius.</p>",
         escaped(run.method),
         if pipe { "a cylinder along the travel" } else { "a plane" },
         list.reference.wave_mm,
         list.cell_mm,
         list.noise_mm,
         list.profile_step_mm,
+        list.least_radius_mm(),
     );
     page.push_str(
         "<p>A round dent or bulge must be at least so deep to be listed:</p><table class=\"limits\"><thead><tr><th>Radius, mm</th>",
