@@ -27,6 +27,8 @@ const TAKEN_OFF_EXPLAINED: f64 = 0.9;
 const TAKEN_OFF_MEASURED: f64 = 0.15;
 const LARGER: f64 = 1.6;
 const HIGHER: (f64, f64) = (0.5, 1.7);
+/// Cells within another's footprint show a part of a dent's height only: its form may be so many times as high.
+const HIGHER_IN_ANOTHER: f64 = 2.2;
 /// What it shows of itself, blurred, is at most so many times as high as the cells: a block's flat top lies far below the
 /// summit of a raised cosine over it.
 const ABOVE_CELLS: f64 = 1.2;
@@ -139,7 +141,8 @@ fn settle(known: &mut [Known], rest: &mut Field, blur: Blur) {
             }
             // An ellipse is looked for once the neighbours are about right.
             let Some(fit) = form.fitted(rest, blur, turn == 1) else { continue };
-            let sure = believed(&start, &fit, blur);
+            let in_another = |j: usize| j != *i && known[j].form.is_some_and(|other| covers(&other, &start));
+            let sure = believed(&start, &fit, blur, (0..known.len()).any(in_another));
             let partly = fit.measured_share < LEAST_MEASURED;
             let good_enough = fit.explained >= TAKEN_OFF_EXPLAINED && fit.measured_share >= TAKEN_OFF_MEASURED;
             if !sure && !(partly && good_enough) {
@@ -166,6 +169,12 @@ fn touch(a: &Form, b: &Form) -> bool {
     (a.column - b.column).abs() < NEIGHBOUR * (wide_a + wide_b) && (a.row - b.row).abs() < NEIGHBOUR * (high_a + high_b)
 }
 
+/// Whether the middle of one lies within another's footprint.
+fn covers(other: &Form, form: &Form) -> bool {
+    let (wide, high) = other.extents();
+    ((form.column - other.column) / wide).hypot((form.row - other.row) / high) < 1.0
+}
+
 /// How far a form moved, as a share of its size and height.
 fn away(from: &Form, to: &Form) -> f64 {
     let (wide, high) = to.extents();
@@ -177,7 +186,7 @@ fn away(from: &Form, to: &Form) -> f64 {
         .max(share(from.height_mm, to.height_mm))
 }
 
-fn believed(start: &Form, fit: &Fit, blur: Blur) -> bool {
+fn believed(start: &Form, fit: &Fit, blur: Blur, in_another: bool) -> bool {
     let form = &fit.form;
     let away = (form.column - start.column).hypot(form.row - start.row);
     let radius = |form: &Form| (form.area_cells() / std::f64::consts::PI).sqrt();
@@ -189,8 +198,8 @@ fn believed(start: &Form, fit: &Fit, blur: Blur) -> bool {
         && is <= LARGER * was
         && was <= LARGER * is
         && higher >= HIGHER.0
-        && higher <= HIGHER.1
-        && form.summit_mm(blur) / start.height_mm <= ABOVE_CELLS
+        && higher <= if in_another { HIGHER_IN_ANOTHER } else { HIGHER.1 }
+        && (in_another || form.summit_mm(blur) / start.height_mm <= ABOVE_CELLS)
 }
 
 /// The cells of a region, and those next to it, belong to no form.
