@@ -145,7 +145,7 @@ fn settle(known: &mut [Known], rest: &mut Field, blur: Blur) {
             let sure = believed(&start, &fit, blur, (0..known.len()).any(in_another));
             let partly = fit.measured_share < LEAST_MEASURED;
             let good_enough = fit.explained >= TAKEN_OFF_EXPLAINED && fit.measured_share >= TAKEN_OFF_MEASURED;
-            if !sure && !(partly && good_enough) {
+            if !(sure || partly && good_enough) {
                 continue;
             }
             form.add_to(rest, 1.0, blur);

@@ -325,7 +325,7 @@ impl Source for VideoFile {
 /// A picture larger than the largest that is taken is refused before memory is asked for.
 pub(super) fn decoder_options() -> ffmpeg::Dictionary {
     let mut options = ffmpeg::Dictionary::new();
-    options.set("max_pixels", &(u64::from(MAX_IMAGE_SIDE_PX) * u64::from(MAX_IMAGE_SIDE_PX)).to_string());
+    options.set("max_pixels", (u64::from(MAX_IMAGE_SIDE_PX) * u64::from(MAX_IMAGE_SIDE_PX)).to_string());
     options
 }
 

@@ -13,11 +13,12 @@ use super::uploads;
 use crate::runs::{CONTENT_TYPES, Page};
 
 /// Routes that give files of any kind, by the beginning and the end of their paths.
-const FILES: [(&str, &str); 4] = [
+const FILES: [(&str, &str); 5] = [
     ("/api/runs/", "/source"),
     ("/api/jobs/", "/products/{name}"),
     ("/api/jobs/", "/tiles/{name}"),
     ("/api/jobs/", "/live/{name}"),
+    ("/api/jobs/", "/residual/{name}"),
 ];
 
 /// Adds them.
