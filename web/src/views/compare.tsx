@@ -75,8 +75,12 @@ function Maps({ runs, jobs }: { runs: Run[]; jobs: Job[] }) {
   );
 }
 
-/** How far each run's world lies from the earlier one's: by the chainages, and by how their surfaces were laid on each other. */
+/**
+ * How far each run's world lies from the earlier one's: by the chainages, and by how their surfaces were laid on each other.
+ * Two measurements of one run have the same world.
+ */
 function shiftsOf([before, after]: Run[], report: ChangeReport | null): Place[] {
+  if (before?.id === after?.id) return [{ x_mm: 0, y_mm: 0 }, { x_mm: 0, y_mm: 0 }];
   const sign = before?.direction === "backward" ? -1 : 1;
   const way_mm = before === undefined || after === undefined ? 0 : sign * (before.chainage_mm - after.chainage_mm);
   const laid = report?.registration;
