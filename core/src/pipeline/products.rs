@@ -384,8 +384,8 @@ impl<'a> Products<'a> {
         report::write(&run, findings, map, &request.out_dir)
     }
 
-    /// Writes the maps, two at a time: both halves squeeze the whole map, each on its own core. Meanwhile the defects
-    /// are looked for.
+    /// Writes the maps, two things at a time: each squeezes or searches the whole map, on its own core. More at a time
+    /// would only need more memory.
     fn write_maps(
         &mut self,
         map: Option<&mut FinishedMap<'_>>,
@@ -400,25 +400,26 @@ impl<'a> Products<'a> {
         let (options, chainage) = (&self.request.recipe.defects, self.request.chainage);
         let shared = SharedMap::new(map);
         std::thread::scope(|scope| {
-            let searching = (wants(ProductGroup::Defects) || wants(ProductGroup::Report))
-                .then(|| scope.spawn(|| find_defects(&mut shared.reader(), options, chainage, sampling, folder)));
-            let beside = scope.spawn(|| -> Result<Option<Picture>> {
-                if wants(ProductGroup::Depth) {
-                    depth_tif::write(&mut shared.reader(), &folder.join("depth.tif"))?;
+            let beside = scope.spawn(|| -> Result<(Option<Picture>, Option<(Findings, Duration)>)> {
+                let mut picture = None;
+                if wants(ProductGroup::Preview) || wants(ProductGroup::Recording) {
+                    let painted = preview::picture(&mut shared.reader(), &text)?;
+                    if wants(ProductGroup::Preview) {
+                        painted.save(&folder.join("preview.png"))?;
+                        painted.save_thumbnail(&folder.join("thumbnail.jpg"))?;
+                    }
+                    picture = Some(painted);
                 }
-                if !wants(ProductGroup::Preview) && !wants(ProductGroup::Recording) {
-                    return Ok(None);
-                }
-                let picture = preview::picture(&mut shared.reader(), &text)?;
-                if wants(ProductGroup::Preview) {
-                    picture.save(&folder.join("preview.png"))?;
-                    picture.save_thumbnail(&folder.join("thumbnail.jpg"))?;
-                }
-                Ok(Some(picture))
+                let found = match wants(ProductGroup::Defects) || wants(ProductGroup::Report) {
+                    true => find_defects(&mut shared.reader(), options, chainage, sampling, folder)?,
+                    false => None,
+                };
+                Ok((picture, found))
             });
             let mut gray = None;
             if wants(ProductGroup::Depth) {
                 progress.step("depth")?;
+                depth_tif::write(&mut shared.reader(), &folder.join("depth.tif"))?;
                 gray = depth_png::write(&mut shared.reader(), folder)?;
             }
             if wants(ProductGroup::Texture) {
@@ -429,17 +430,10 @@ impl<'a> Products<'a> {
                 progress.step("tiles")?;
                 tiles.finish(&mut shared.reader())?;
             }
-            if wants(ProductGroup::Preview) {
-                progress.step("preview")?;
+            if wants(ProductGroup::Defects) || wants(ProductGroup::Report) {
+                progress.step("defects")?;
             }
-            let picture = beside.join().map_err(|_| Error::internal("maps", "a thread panicked"))??;
-            let found = match searching {
-                Some(searching) => {
-                    progress.step("defects")?;
-                    searching.join().map_err(|_| Error::internal("defects", "a thread panicked"))??
-                }
-                None => None,
-            };
+            let (picture, found) = beside.join().map_err(|_| Error::internal("maps", "a thread panicked"))??;
             Ok(Maps { gray, picture, found })
         })
     }

@@ -53,7 +53,6 @@ export const runTexts = {
       measuring: "Measuring: following the laser line and the robot's motion, frame by frame",
       depth: "Writing the depth map",
       texture: "Writing the visible image of the wall",
-      preview: "Drawing the preview",
       tiles: "Writing the map's tiles",
       cloud: "Writing the point cloud",
       trajectory: "Writing the robot's path",

@@ -13,21 +13,20 @@ const LEAST_SLOPE_RAD: f32 = 0.02;
 /// Per pixel from −1 (in shadow) to 1 (lit); 0 where nothing was measured.
 pub(super) fn shade(map: &Reduced) -> Vec<f32> {
     let (width, height) = (map.width_px, map.height_px);
+    // Large maps: each step takes the place of the one before.
     let smooth = blurred(&map.depth_mm, width, height, (FINE_PX, FINE_PX));
-    let slope = slopes(&smooth, width, height, map.mm_per_px as f32);
-    let shape = blurred(&slope, width, height, SHAPE_PX);
-    let relief: Vec<f32> = slope.iter().zip(&shape).map(|(slope, shape)| slope - shape).collect();
-    let middle = percentile(&shape, 0.5).unwrap_or_default();
-    let leaning: Vec<f32> = shape.iter().map(|s| s - middle).collect();
+    let mut relief = slopes(&smooth, width, height, map.mm_per_px as f32);
+    drop(smooth);
+    let mut leaning = blurred(&relief, width, height, SHAPE_PX);
+    relief.iter_mut().zip(&leaning).for_each(|(slope, shape)| *slope -= shape);
+    let middle = percentile(leaning.iter().copied(), 0.5).unwrap_or_default();
+    leaning.iter_mut().for_each(|shape| *shape -= middle);
     let (gain_relief, gain_shape) = (gain(&relief), gain(&leaning));
+    for (relief, shape) in relief.iter_mut().zip(&leaning) {
+        let lit = 0.85 * soft(*relief * gain_relief) + 0.15 * soft(shape * gain_shape);
+        *relief = if lit.is_finite() { lit } else { 0.0 };
+    }
     relief
-        .iter()
-        .zip(&leaning)
-        .map(|(relief, shape)| {
-            let lit = 0.85 * soft(relief * gain_relief) + 0.15 * soft(shape * gain_shape);
-            if lit.is_finite() { lit } else { 0.0 }
-        })
-        .collect()
 }
 
 /// From −1 to 1, with room left for the steepest.
@@ -37,12 +36,11 @@ fn soft(light: f32) -> f32 {
 
 /// What brings the larger slopes of a map near full light.
 fn gain(slopes: &[f32]) -> f32 {
-    let sizes: Vec<f32> = slopes.iter().map(|s| s.abs()).collect();
-    1.0 / percentile(&sizes, 0.97).unwrap_or_default().max(LEAST_SLOPE_RAD)
+    1.0 / percentile(slopes.iter().map(|s| s.abs()), 0.97).unwrap_or_default().max(LEAST_SLOPE_RAD)
 }
 
-fn percentile(values: &[f32], share: f64) -> Option<f32> {
-    let mut finite: Vec<f32> = values.iter().copied().filter(|v| v.is_finite()).collect();
+fn percentile(values: impl Iterator<Item = f32>, share: f64) -> Option<f32> {
+    let mut finite: Vec<f32> = values.filter(|v| v.is_finite()).collect();
     let index = (finite.len().checked_sub(1)? as f64 * share) as usize;
     Some(*finite.select_nth_unstable_by(index, f32::total_cmp).1)
 }
