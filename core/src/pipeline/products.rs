@@ -400,7 +400,7 @@ impl<'a> Products<'a> {
         let (options, chainage) = (&self.request.recipe.defects, self.request.chainage);
         let shared = SharedMap::new(map);
         std::thread::scope(|scope| {
-            let beside = scope.spawn(|| -> Result<(Option<Picture>, Option<(Findings, Duration)>)> {
+            let beside = scope.spawn(|| -> Result<Maps> {
                 let mut picture = None;
                 if wants(ProductGroup::Preview) || wants(ProductGroup::Recording) {
                     let painted = preview::picture(&mut shared.reader(), &text)?;
@@ -414,7 +414,7 @@ impl<'a> Products<'a> {
                     true => find_defects(&mut shared.reader(), options, chainage, sampling, folder)?,
                     false => None,
                 };
-                Ok((picture, found))
+                Ok(Maps { gray: None, picture, found })
             });
             let mut gray = None;
             if wants(ProductGroup::Depth) {
@@ -433,8 +433,8 @@ impl<'a> Products<'a> {
             if wants(ProductGroup::Defects) || wants(ProductGroup::Report) {
                 progress.step("defects")?;
             }
-            let (picture, found) = beside.join().map_err(|_| Error::internal("maps", "a thread panicked"))??;
-            Ok(Maps { gray, picture, found })
+            let maps = beside.join().map_err(|_| Error::internal("maps", "a thread panicked"))??;
+            Ok(Maps { gray, ..maps })
         })
     }
 
