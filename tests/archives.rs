@@ -172,6 +172,8 @@ fn the_readers_of_others_see_what_the_job_saw() {
     );
     let points = |name: &str| entities[name]["components"]["Points3D:positions"]["values"].as_u64();
     assert_eq!(points("surface"), Some(3 * manifest.quality.points), "three numbers a point");
+    let overview = points("surface/overview").expect("the whole surface in one message");
+    assert!((1..=3 * manifest.quality.points).contains(&overview), "{overview} numbers");
 }
 
 fn count(read: &Value, topic: &str) -> usize {

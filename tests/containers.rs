@@ -241,6 +241,40 @@ fn the_image_is_built_from_what_is_there_and_runs_as_nobody() {
     }
 }
 
+/// The steps of the image as the script without an engine would carry them out, and as another reader of the Dockerfile
+/// sees them.
+#[test]
+fn the_script_without_an_engine_carries_out_every_step_of_the_image() {
+    let plan = run(root().join("docker/build-without-engine.sh"), &["--plan"]);
+    let plain = |line: &str| line.split_whitespace().collect::<Vec<_>>().join(" ");
+    let steps: Vec<String> = String::from_utf8_lossy(&plan).lines().map(plain).collect();
+    let mut expected = Vec::new();
+    let mut stage = String::new();
+    for step in files()["dockerfile"].as_array().expect("instructions") {
+        let rest = step["rest"].as_str().expect("what it does");
+        match step["do"].as_str().expect("a name") {
+            "FROM" => {
+                let (variable, name) = rest.split_once(" AS ").unwrap_or((rest, "image"));
+                let variable = variable.trim_start_matches("${").trim_end_matches('}');
+                let given = instruction("ARG").into_iter().filter_map(|arg| arg["rest"].as_str()?.split_once('='));
+                let image = given.filter(|(name, _)| *name == variable).map(|(_, image)| image).next_back();
+                stage = name.to_string();
+                expected.push(format!("[{stage}] FROM {}", image.expect("its default")));
+            }
+            name @ ("RUN" | "COPY") => expected.push(plain(&format!("[{stage}] {name} {rest}"))),
+            _ => {}
+        }
+    }
+    let start = [words(&last("ENTRYPOINT")["list"]), words(&last("CMD")["list"])].concat().join(" ");
+    expected.push(format!("[{stage}] {start} (as {})", last("USER")["rest"].as_str().expect("a user")));
+    expected.push(format!("[{stage}] {}", words(&last("HEALTHCHECK")["check"]).join(" ")));
+    assert_eq!(steps, expected);
+    assert!(expected.iter().filter(|step| step.contains("] RUN ")).count() >= 5, "{expected:?}");
+    // What it does not know it does not pass over.
+    let odd = Command::new(root().join("docker/build-without-engine.sh")).arg("--everything").output().expect("bash");
+    assert_eq!(odd.status.code(), Some(2));
+}
+
 #[test]
 fn the_set_up_step_brings_what_the_binary_needs() {
     let script = root().join("docker/set-up.sh");

@@ -14,6 +14,8 @@ struct Made {
     folder: TempDir,
 }
 
+/// Where the runs begin on their asset, mm.
+const CHAINAGE_MM: f64 = 12000.0;
 /// The operator's codes of these tests.
 const CODES: &str = "defects.codes=dent=BAA; bulge=BAA; dent.severe=BAA A";
 
@@ -30,12 +32,48 @@ impl Made {
         made
     }
 
-    /// Processes the run into a folder.
+    /// The same wall seen on the way back, by a camera that has turned half about its axis: the pictures turned so, the last
+    /// one first. The world's x then counts from where the run ended.
+    fn on_the_way_back(&self) -> Made {
+        let folder = tempfile::tempdir().expect("a temporary folder");
+        let (run, back) = (self.folder.path().join("run"), folder.path().join("run"));
+        std::fs::create_dir(&back).expect("a folder");
+        let status = Command::new("ffmpeg")
+            .args(["-v", "error", "-i", text(&run.join("video.mp4")), "-vf", "hflip,vflip,reverse", "-crf", "14"])
+            .arg(back.join("video.mp4"))
+            .status();
+        assert!(status.expect("ffmpeg is missing: `make setup` installs it").success());
+        let rig = std::fs::read_to_string(run.join("rig.toml")).expect("a rig");
+        let turned = rig.lines().map(|line| match line.strip_prefix("plane_normal = [") {
+            Some(values) => {
+                let values: Vec<f64> =
+                    values.trim_end_matches(']').split(", ").map(|v| v.parse().expect("a number")).collect();
+                format!("plane_normal = [{:?}, {:?}, {:?}]\n", -values[0], -values[1], values[2])
+            }
+            None => format!("{line}\n"),
+        });
+        std::fs::write(back.join("rig.toml"), turned.collect::<String>()).expect("written");
+        let trajectory = std::fs::read_to_string(run.join("truth/trajectory.csv")).expect("a trajectory");
+        let column = trajectory.lines().next().expect("a header").split(',').position(|name| name == "x_mm");
+        let last = trajectory.lines().last().expect("a row").split(',').nth(column.expect("x_mm")).expect("x_mm");
+        let start_mm = CHAINAGE_MM + last.parse::<f64>().expect("a number");
+        let made = Made { folder };
+        let chainage = format!("--chainage-mm={start_mm}");
+        made.process_at(&made.products(), "depth,defects", &[&chainage, "--direction", "backward"]);
+        made
+    }
+
+    /// Processes the run, from [`CHAINAGE_MM`] on, into a folder.
     fn process(&self, out: &Path, groups: &str, options: &[&str]) {
+        let chainage = format!("--chainage-mm={CHAINAGE_MM}");
+        self.process_at(out, groups, &[&[chainage.as_str()], options].concat());
+    }
+
+    fn process_at(&self, out: &Path, groups: &str, options: &[&str]) {
         let run = self.folder.path().join("run");
         let (video, rig) = (run.join("video.mp4"), run.join("rig.toml"));
         let mut process = vec!["process", text(&video), "--rig", text(&rig), "--out", text(out), "--only", groups];
-        process.extend(["--asset", "Tunnel <3>", "--chainage-mm", "12000"]);
+        process.extend(["--asset", "Tunnel <3>"]);
         process.extend(options);
         succeed(&process, &[0, 3]);
     }
@@ -115,7 +153,7 @@ fn every_known_defect_is_found_with_its_kind_and_figures_and_nothing_else() {
         };
         assert_eq!(found["kind"], kind, "{found:#}");
         assert!((number(found, "area_mm2") / area - 1.0).abs() < 0.15, "{area} mm²: {found:#}");
-        assert!((number(found, "chainage_mm") - number(found, "x_mm") - 12000.0).abs() < 0.01);
+        assert!((number(found, "chainage_mm") - number(found, "x_mm") - CHAINAGE_MM).abs() < 0.01);
         let code = match (kind, found["severity"].as_str()) {
             ("dent", Some("severe")) => "BAA A".into(),
             ("dent" | "bulge", _) => "BAA".into(),
@@ -139,7 +177,10 @@ fn foreign_programs_read_the_list_the_sections_and_the_residual_map() {
 #[test]
 fn a_sound_wall_gives_an_empty_list_also_under_a_gait() {
     for motion in ["wheels", "gait"] {
-        let made = Made::new("sound", &["--seconds", "2.5", "--fps", "20", "--seed", "31", "--motion", motion]);
+        let made = Made::new(
+            "sound",
+            &["--seconds", "2.5", "--fps", "20", "--size", "960x540", "--seed", "31", "--motion", motion],
+        );
         let list = made.list();
         assert_eq!(made.defects(), Vec::<Value>::new(), "{motion}");
         let limit = number(&list, "detection_limit_mm");
@@ -152,7 +193,10 @@ fn a_sound_wall_gives_an_empty_list_also_under_a_gait() {
 #[test]
 fn a_pipe_s_radius_and_ovality_are_measured() {
     for (scene, ovality) in [("pipe-oval", 1.0), ("pipe-steady", 0.0)] {
-        let made = Made::new(scene, &["--seconds", "2.5", "--fps", "20", "--motion", "steady", "--seed", "42"]);
+        let made = Made::new(
+            scene,
+            &["--seconds", "2.5", "--fps", "20", "--size", "960x540", "--motion", "steady", "--seed", "42"],
+        );
         let reference = made.list()["reference"].clone();
         assert_eq!(reference["kind"], "cylinder");
         // From the arc alone, with what is said about how sure that is.
@@ -172,7 +216,7 @@ fn a_pipe_s_radius_and_ovality_are_measured() {
 }
 
 #[test]
-fn two_runs_show_what_became_of_the_wall_and_nothing_else() {
+fn two_runs_show_what_became_of_the_wall_and_nothing_else_whichever_way_they_went() {
     let run = |seed: &str, later: bool| {
         let mut options = vec!["--seconds", "2.6", "--seed", seed, "--wall-seed", "7"];
         options.extend(later.then_some("--later"));
@@ -188,8 +232,6 @@ fn two_runs_show_what_became_of_the_wall_and_nothing_else() {
     assert_eq!(same["changes"], Value::Array(Vec::new()), "the same wall, measured twice");
     assert!(same["unchanged"].as_array().is_some_and(|all| all.len() > 3), "{same:#}");
 
-    let list = changes(&first, &later);
-    let found = list["changes"].as_array().expect("changes");
     let (before, after) = (first.truth(), later.truth());
     let heights = |truth: &Value| truth["features"].as_array().expect("features").clone();
     let at = |feature: &Value| (number(feature, "x"), number(feature, "y"));
@@ -201,14 +243,19 @@ fn two_runs_show_what_became_of_the_wall_and_nothing_else() {
             (delta != 0.0).then_some((feature, delta))
         })
         .collect();
-    assert_eq!((changed.len(), found.len()), (2, 2), "{list:#}");
-    for (feature, delta) in changed {
-        let near = |c: &&Value| {
-            (number(c, "x_mm") - number(&feature, "x")).hypot(number(c, "y_mm") - number(&feature, "y")) < 6.0
-        };
-        let change = found.iter().find(near).unwrap_or_else(|| panic!("{feature} is not in {list:#}"));
-        assert_eq!(change["state"], if delta == 2.0 { "grown" } else { "new" }, "{change:#}");
-        assert!((number(change, "delta_depth_mm") - delta).abs() < 0.4, "{delta} mm: {change:#}");
+    for list in [changes(&first, &later), changes(&first, &later.on_the_way_back())] {
+        let found = list["changes"].as_array().expect("changes");
+        assert_eq!((changed.len(), found.len()), (2, 2), "{list:#}");
+        for (feature, delta) in &changed {
+            let near = |c: &&Value| {
+                (number(c, "x_mm") - number(feature, "x")).hypot(number(c, "y_mm") - number(feature, "y")) < 6.0
+            };
+            let change = found.iter().find(near).unwrap_or_else(|| panic!("{feature} is not in {list:#}"));
+            assert_eq!(change["state"], if *delta == 2.0 { "grown" } else { "new" }, "{change:#}");
+            assert!((number(change, "delta_depth_mm") - delta).abs() < 0.4, "{delta} mm: {change:#}");
+            assert!((number(change, "chainage_mm") - CHAINAGE_MM - number(change, "x_mm")).abs() < 0.01, "{change:#}");
+        }
+        assert!(list["unchanged"].as_array().is_some_and(|all| all.len() > 3), "{list:#}");
     }
 }
 

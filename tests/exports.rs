@@ -4,6 +4,7 @@
 mod exports {
     mod cut;
     mod formats;
+    mod map_size;
     mod memory;
 
     use std::path::Path;

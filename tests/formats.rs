@@ -155,7 +155,7 @@ fn the_mesh_is_valid_gltf_where_the_wall_is() {
     let folder = folder();
     let map = map_and_tiles(folder.path());
     let path = folder.path().join("wall.glb");
-    let facts = mesh_glb::write(&path, folder.path(), 250_000).expect("a mesh");
+    let facts = mesh_glb::write(&path, folder.path(), 250_000, &mesh_glb::ALL_MM).expect("a mesh");
     // Half size: 651 x 306 px, less the hole of 45 x 27.
     assert!((190_000..199_206).contains(&facts.vertices) && facts.textured && facts.mm_per_vertex == 1.0, "{facts:?}");
     let report = read_with_node("gltf.mjs", &path);
@@ -178,8 +178,19 @@ fn the_mesh_is_valid_gltf_where_the_wall_is() {
     let depths = || map.pixels().depth_mm.iter().filter(|z| z.is_finite()).map(|z| f64::from(*z));
     near(&report["high"][2], -depths().fold(f64::INFINITY, f64::min));
     near(&report["low"][2], -depths().fold(f64::NEG_INFINITY, f64::max));
-    let whole = mesh_glb::write(&path, folder.path(), 1_000_000).expect("a mesh");
+    let whole = mesh_glb::write(&path, folder.path(), 1_000_000, &mesh_glb::ALL_MM).expect("a mesh");
     assert!(whole.mm_per_vertex == 0.5 && whole.vertices > 3 * facts.vertices, "{whole:?}");
+    // A stretch of the way has as many vertices for itself.
+    let stretch = mesh_glb::write(&path, folder.path(), 250_000, &(-300.0..=-150.0)).expect("a mesh");
+    assert!(stretch.mm_per_vertex == 0.5 && stretch.textured, "{stretch:?}");
+    let report = read_with_node("gltf.mjs", &path);
+    assert_eq!((&report["issues"]["numErrors"], &report["issues"]["numWarnings"]), (&json!(0), &json!(0)), "{report}");
+    for (end, expected_m) in [("low", -0.3), ("high", -0.15)] {
+        let found_m = report[end][0].as_f64().unwrap_or(f64::NAN);
+        assert!((found_m - expected_m).abs() < 0.0005, "{end}: {found_m} m");
+    }
+    let beside = mesh_glb::write(&path, folder.path(), 250_000, &(5000.0..=6000.0)).expect_err("nothing there");
+    assert!(beside.to_string().contains("beside the map"), "{beside}");
 }
 
 #[test]

@@ -87,9 +87,13 @@ struct StripeErrors {
 
 impl Measured {
     fn stripe_errors(&self) -> StripeErrors {
+        self.stripe_errors_in(0..self.truth.len())
+    }
+
+    fn stripe_errors_in(&self, frames: std::ops::Range<usize>) -> StripeErrors {
         let rows = self.truth[0].stripe_across_px.len();
         let (mut errors, mut measurable, mut found, mut wrong) = (Vec::new(), 0usize, 0usize, 0usize);
-        for (frame, truth) in self.truth.iter().enumerate() {
+        for (frame, truth) in self.truth.iter().enumerate().filter(|(frame, _)| frames.contains(frame)) {
             for row in 0..rows {
                 let (at, expected) = (self.stripes[frame * rows + row], truth.stripe_across_px[row]);
                 measurable += usize::from(truth.measurable[row]);
@@ -108,7 +112,7 @@ impl Measured {
             median_px: quantile(errors.clone(), 0.5),
             p95_px: quantile(errors, 0.95),
             found: found as f64 / measurable as f64,
-            false_share: wrong as f64 / self.stripes.len() as f64,
+            false_share: wrong as f64 / (frames.len() * rows) as f64,
         }
     }
 
@@ -118,6 +122,17 @@ impl Measured {
         let last = self.poses.iter().rposition(Option::is_some).expect("a pose");
         let truth = self.truth[last].world_from_camera.translation.x;
         (found - truth) / truth
+    }
+
+    /// The last pose is where it should be within what is stated of the drift, and that is no blank cheque.
+    fn assert_drift_as_stated(&self) {
+        let drift = self.manifest.quality.drift.expect("a way without a break tells its drift");
+        let found = self.poses.last().copied().flatten().expect("a pose").translation.vector;
+        let off = found - self.truth[self.truth.len() - 1].world_from_camera.translation.vector;
+        println!("end off by {:.2} {:.2} {:.2} mm, stated {drift:?}", off.x, off.y, off.z);
+        for (off_mm, stated_mm) in [(off.x, drift.x_mm), (off.y, drift.y_mm), (off.z, drift.z_mm)] {
+            assert!(off_mm.abs() < 3.0 * stated_mm && stated_mm < 0.01 * self.manifest.quality.travel_mm);
+        }
     }
 
     /// Depth of each point of the cloud less that of the true surface there, mm: without any alignment.
@@ -153,10 +168,15 @@ fn a_wall_is_met_within_the_bars() {
     );
     assert!(stripe.median_px < 0.06 && stripe.p95_px < 0.20);
     assert!(stripe.found > 0.99 && stripe.false_share < 0.001);
+    // No earlier frame shows the first ones' wall without the laser: later ones do.
+    let first = run.stripe_errors_in(0..5);
+    println!("wall, first five frames: stripe median {:.3} px, p95 {:.3} px", first.median_px, first.p95_px);
+    assert!(first.median_px < 1.3 * stripe.median_px && first.p95_px < 1.3 * stripe.p95_px);
     assert!(run.travel_error().abs() < 0.003);
     assert!(depth_mm < 0.6, "{depth_mm} mm");
     assert_eq!(run.manifest.quality.frames_6_dof, u64::from(run.simulation.frames_total()));
     assert_eq!(run.manifest.quality.breaks, 0);
+    run.assert_drift_as_stated();
 }
 
 #[test]
@@ -175,6 +195,7 @@ fn a_pipe_with_gait_and_highlight_is_met_within_the_bars() {
     assert!(stripe.found > 0.98 && stripe.false_share < 0.001);
     assert!(run.travel_error().abs() < 0.005);
     assert!(depth_mm < 0.4, "{depth_mm} mm");
+    run.assert_drift_as_stated();
 }
 
 #[test]

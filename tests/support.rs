@@ -128,7 +128,7 @@ pub fn files_below(folder: &Path) -> Vec<String> {
 ///
 /// # Panics
 /// Where it does not come.
-pub fn eventually(what: &str, condition: impl Fn() -> bool) {
+pub fn eventually(what: &str, mut condition: impl FnMut() -> bool) {
     let begun = Instant::now();
     while !condition() {
         assert!(begun.elapsed() < Duration::from_secs(20), "waited in vain: {what}");

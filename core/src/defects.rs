@@ -32,6 +32,7 @@ mod regions;
 mod register;
 mod section;
 mod stretch;
+mod turned;
 
 use crate::depth_map::MapReader;
 use crate::error::Result;
@@ -47,9 +48,6 @@ pub use list::{
 
 /// Smoothing before the search, standard deviation in cells.
 const SMOOTHING_CELLS: f32 = 1.2;
-/// Columns of cells that a stretch answers for, and that it reads on each side besides.
-const CORE_COLUMNS: usize = 2048;
-const MARGIN_COLUMNS: usize = 384;
 /// Places where the kind of shape is looked at, and their length in coarse cells.
 const SAMPLES: usize = 12;
 const SAMPLE_COARSE: usize = 64;
@@ -82,6 +80,8 @@ pub struct Sampling {
     pub profile_step_mm: f64,
     /// Distance of two line positions on the surface, mm; 0 where it is not known.
     pub line_step_mm: f64,
+    /// Width of the laser's line on the surface, mm at half of its height; 0 where it is not known.
+    pub line_width_mm: f64,
 }
 
 /// A stretch of the residual map, in cells: the deviation from the undamaged shape.
@@ -131,9 +131,7 @@ pub fn find(
     };
     let (shape, radius_sd_mm) = choose(&samples(map, &grid)?);
     let mut gathered = Gathered::default();
-    for start in (0..grid.columns).step_by(CORE_COLUMNS) {
-        let core = start..(start + CORE_COLUMNS).min(grid.columns);
-        let columns = start.saturating_sub(MARGIN_COLUMNS)..(core.end + MARGIN_COLUMNS).min(grid.columns);
+    for (core, columns) in grid.stretches() {
         let depth = grid.read(map, columns.start, columns.len())?;
         let task = Task { grid: &grid, options, shape, wave_mm, sampling, columns, core: core.clone() };
         let examined = examine(&task, &depth);

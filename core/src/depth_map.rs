@@ -4,25 +4,31 @@
 //! touched for long wait in a scratch file, so a long run needs no more memory than a short one.
 
 mod grid;
+mod reader;
 pub mod sheet;
 pub mod strips;
 
 use std::collections::{HashMap, HashSet};
 use std::fs::File;
+use std::ops::Range;
 use std::os::unix::fs::FileExt;
 use std::path::Path;
-use std::sync::{Mutex, MutexGuard, PoisonError};
 
 use serde::{Deserialize, Serialize};
 
 use crate::error::{Error, Result};
 
 pub use grid::GridMap;
+pub use reader::{BAND_ROWS, FinishedMap, MapReader, MapWindow, SharedMap, SharedReader, band, rectangles};
 
 /// Side of a map tile, px.
 pub const TILE_SIDE_PX: usize = 256;
 
 const TILE_PX: usize = TILE_SIDE_PX * TILE_SIDE_PX;
+/// Tiles of a finished map that are held in memory, where it does not fit there as a whole: readers go through it once.
+const READ_TILES: usize = 8;
+/// A window of so many columns of a tile, or more, is read past the tiles in memory.
+const READ_PAST_PX: i64 = TILE_SIDE_PX as i64 / 2;
 /// A tile on disk: depth and its weight as float32, then red, green, blue and a flag a pixel.
 const TILE_BYTES: usize = TILE_PX * 12;
 
@@ -41,95 +47,18 @@ pub struct MapGeometry {
     pub height_px: usize,
 }
 
-/// A rectangle of the map, row by row.
-#[derive(Clone, Debug, PartialEq)]
-pub struct MapWindow {
-    /// Columns.
-    pub width_px: usize,
-    /// Rows.
-    pub height_px: usize,
-    /// World z, mm; NaN where nothing was measured. `height_px * width_px` values.
-    pub depth_mm: Vec<f32>,
-    /// Red, green, blue of the visible image; `None` where no image fell. `height_px * width_px` values.
-    pub texture: Vec<Option<[u8; 3]>>,
+/// How large a map may become; what is beyond is left out of it.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub struct MapLimits {
+    /// Most rows.
+    pub rows: u64,
+    /// Most pixels, the empty ones between what was measured included.
+    pub pixels: u64,
 }
 
-impl MapWindow {
-    /// A window in which nothing was measured.
-    pub fn empty(width_px: usize, height_px: usize) -> MapWindow {
-        let size = width_px * height_px;
-        MapWindow { width_px, height_px, depth_mm: vec![f32::NAN; size], texture: vec![None; size] }
-    }
-}
-
-/// A map that can be read in rectangles, however large it is: what the exports read from.
-pub trait MapReader {
-    /// Where the map lies and how large it is.
-    fn geometry(&self) -> MapGeometry;
-
-    /// Reads a rectangle of the map; what lies outside is empty.
-    fn window(&mut self, column_px: usize, row_px: usize, width_px: usize, height_px: usize) -> Result<MapWindow>;
-}
-
-/// A map in which something was measured, for reading.
-pub struct FinishedMap<'a> {
-    map: &'a mut SurfaceMap,
-    geometry: MapGeometry,
-}
-
-impl FinishedMap<'_> {
-    /// Share of the map's pixels that have a depth, 0 to 1.
-    pub fn coverage(&self) -> f64 {
-        self.map.measured as f64 / (self.geometry.width_px * self.geometry.height_px) as f64
-    }
-}
-
-impl MapReader for FinishedMap<'_> {
-    fn geometry(&self) -> MapGeometry {
-        self.geometry
-    }
-
-    fn window(&mut self, column_px: usize, row_px: usize, width_px: usize, height_px: usize) -> Result<MapWindow> {
-        self.map.window(column_px, row_px, width_px, height_px)
-    }
-}
-
-/// A map that several threads read, one rectangle at a time.
-pub struct SharedMap<'a, 'm> {
-    map: Mutex<&'a mut FinishedMap<'m>>,
-}
-
-/// One thread's view of a [`SharedMap`].
-pub struct SharedReader<'s, 'a, 'm> {
-    shared: &'s SharedMap<'a, 'm>,
-    geometry: MapGeometry,
-}
-
-impl<'a, 'm> SharedMap<'a, 'm> {
-    /// Shares a map.
-    pub fn new(map: &'a mut FinishedMap<'m>) -> SharedMap<'a, 'm> {
-        SharedMap { map: Mutex::new(map) }
-    }
-
-    /// A reader for one thread.
-    pub fn reader(&self) -> SharedReader<'_, 'a, 'm> {
-        SharedReader { shared: self, geometry: self.lock().geometry }
-    }
-
-    /// A thread that panicked while it read has changed nothing that matters.
-    fn lock(&self) -> MutexGuard<'_, &'a mut FinishedMap<'m>> {
-        self.map.lock().unwrap_or_else(PoisonError::into_inner)
-    }
-}
-
-impl MapReader for SharedReader<'_, '_, '_> {
-    fn geometry(&self) -> MapGeometry {
-        self.geometry
-    }
-
-    fn window(&mut self, column_px: usize, row_px: usize, width_px: usize, height_px: usize) -> Result<MapWindow> {
-        self.shared.lock().window(column_px, row_px, width_px, height_px)
-    }
+impl MapLimits {
+    /// For maps whose size is bounded by what they are made from.
+    pub const NONE: MapLimits = MapLimits { rows: u64::MAX, pixels: u64::MAX };
 }
 
 /// How the grid lies in the world: the centre of grid pixel (0, 0) and the pixel's size.
@@ -171,6 +100,8 @@ pub struct SurfaceMap {
     /// Bounds of the measured pixels on the grid: columns and rows, both ends included.
     bounds: Option<([i64; 2], [i64; 2])>,
     measured: u64,
+    limits: MapLimits,
+    left_out: u64,
 }
 
 /// Column and row of a tile on the grid; negative left of and above grid pixel (0, 0).
@@ -208,24 +139,41 @@ impl SurfaceMap {
             changed: HashSet::new(),
             bounds: None,
             measured: 0,
+            limits: MapLimits::NONE,
+            left_out: 0,
         })
+    }
+
+    /// The same map, which never becomes larger than `limits`.
+    pub fn limited(self, limits: MapLimits) -> SurfaceMap {
+        SurfaceMap { limits, ..self }
+    }
+
+    /// How often something was left out since it would have made the map larger than its limits.
+    pub fn left_out(&self) -> u64 {
+        self.left_out
     }
 
     /// Puts a depth on a grid pixel; a later one replaces an earlier one.
     pub fn put_depth(&mut self, column: i64, row: i64, depth_mm: f32) -> Result<()> {
+        if !self.makes_room([column, column], row) {
+            return Ok(());
+        }
         let (index, at) = place(column, row);
         let tile = self.tile(index)?;
         let was_empty = tile.depth_mm[at].is_nan();
         (tile.depth_mm[at], tile.weight[at]) = (depth_mm, 1.0);
         (tile.dirty, tile.changed) = (true, true);
         self.measured += u64::from(was_empty);
-        self.reach([column, column], row);
         Ok(())
     }
 
     /// Puts cells side by side from a grid pixel on, along +x: a depth becomes the weighted mean of all that were put
     /// there, the first colour stays.
     pub fn blend_run(&mut self, column: i64, row: i64, cells: &[Cell]) -> Result<()> {
+        if cells.is_empty() || !self.makes_room([column, column + cells.len() as i64 - 1], row) {
+            return Ok(());
+        }
         let mut done = 0;
         while done < cells.len() {
             let (index, at) = place(column + done as i64, row);
@@ -250,21 +198,40 @@ impl SurfaceMap {
             self.measured += new;
             done += part.len();
         }
-        if !cells.is_empty() {
-            self.reach([column, column + cells.len() as i64 - 1], row);
-        }
         Ok(())
     }
 
-    /// Widens the bounds of what was measured.
-    fn reach(&mut self, [first, last]: [i64; 2], row: i64) {
-        let (columns, rows) = self.bounds.get_or_insert(([first, last], [row, row]));
-        *columns = [columns[0].min(first), columns[1].max(last)];
-        *rows = [rows[0].min(row), rows[1].max(row)];
+    /// The bounds with some pixels of a row within them; `None` where the map would pass its limits.
+    fn reach(&self, [first, last]: [i64; 2], row: i64) -> Option<([i64; 2], [i64; 2])> {
+        let (columns, rows) = self.bounds.unwrap_or(([first, last], [row, row]));
+        let wider = ([columns[0].min(first), columns[1].max(last)], [rows[0].min(row), rows[1].max(row)]);
+        if Some(wider) == self.bounds {
+            return Some(wider);
+        }
+        let length = |[first, last]: [i64; 2]| last.abs_diff(first).saturating_add(1);
+        let (width, height) = (length(wider.0), length(wider.1));
+        (height <= self.limits.rows && width.saturating_mul(height) <= self.limits.pixels).then_some(wider)
     }
 
-    /// Puts a colour on a grid pixel that has none, or on any with `replace`.
+    /// Widens the bounds of what was measured; false, and counted, where there is no room.
+    pub(crate) fn makes_room(&mut self, columns: [i64; 2], row: i64) -> bool {
+        match self.reach(columns, row) {
+            Some(wider) => {
+                self.bounds = Some(wider);
+                true
+            }
+            None => {
+                self.left_out += 1;
+                false
+            }
+        }
+    }
+
+    /// Puts a colour on a grid pixel that has none, or on any with `replace`; what the map has no room for is left out.
     pub fn put_texture(&mut self, column: i64, row: i64, rgb: [u8; 3], replace: bool) -> Result<()> {
+        if self.reach([column, column], row).is_none() {
+            return Ok(());
+        }
         let (index, at) = place(column, row);
         let tile = self.tile(index)?;
         if replace || tile.texture[at][3] == 0 {
@@ -274,10 +241,19 @@ impl SurfaceMap {
         Ok(())
     }
 
-    /// The map as it is now, for reading; `None` where nothing was measured.
-    pub fn finished(&mut self) -> Option<FinishedMap<'_>> {
-        let geometry = self.geometry()?;
-        Some(FinishedMap { map: self, geometry })
+    /// The map as it is now, for reading; `None` where nothing was measured. One that does not fit into memory is put aside
+    /// whole: what is made of it needs the room.
+    ///
+    /// # Errors
+    /// What the scratch file's disk says.
+    pub fn finished(&mut self) -> Result<Option<FinishedMap<'_>>> {
+        let Some(geometry) = self.geometry() else { return Ok(None) };
+        if !self.slots.is_empty() {
+            (0..self.tiles.len()).try_for_each(|at| self.put_aside(at))?;
+            (self.tiles, self.last) = (Vec::new(), None);
+            self.capacity = self.capacity.min(READ_TILES);
+        }
+        Ok(Some(FinishedMap { map: self, geometry }))
     }
 
     /// The tiles that changed since this was last asked.
@@ -291,7 +267,7 @@ impl SurfaceMap {
     /// A whole tile of the grid.
     pub fn tile_window(&mut self, index: TileIndex) -> Result<MapWindow> {
         let mut window = MapWindow::empty(TILE_SIDE_PX, TILE_SIDE_PX);
-        copy_part(self.tile(index)?, (0, 0), &mut window);
+        copy_part(self.tile(index)?.rows(), (0, 0), &mut window);
         Ok(window)
     }
 
@@ -315,17 +291,20 @@ impl SurfaceMap {
         let side = TILE_SIDE_PX as i64;
         for tile_row in top.div_euclid(side)..=(top + height_px as i64 - 1).div_euclid(side) {
             for tile_column in left.div_euclid(side)..=(left + width_px as i64 - 1).div_euclid(side) {
-                if self.exists((tile_column, tile_row)) {
-                    let tile = self.tile((tile_column, tile_row))?;
-                    copy_part(tile, (tile_column * side - left, tile_row * side - top), &mut window);
+                let (index, offset) = ((tile_column, tile_row), (tile_column * side - left, tile_row * side - top));
+                let columns = (offset.0 + side).min(width_px as i64) - offset.0.max(0);
+                match self.slots.get(&index) {
+                    Some(slot) if columns >= READ_PAST_PX && !self.places.contains_key(&index) => {
+                        let rows = (-offset.1).max(0) as usize..side.min(height_px as i64 - offset.1) as usize;
+                        let rows = self.read_rows(*slot, rows)?;
+                        copy_part(rows.view(), offset, &mut window);
+                    }
+                    None if !self.places.contains_key(&index) => {}
+                    _ => copy_part(self.tile(index)?.rows(), offset, &mut window),
                 }
             }
         }
         Ok(window)
-    }
-
-    fn exists(&self, index: TileIndex) -> bool {
-        self.places.contains_key(&index) || self.slots.contains_key(&index)
     }
 
     /// The tile, from memory, from the scratch file, or new.
@@ -361,10 +340,16 @@ impl SurfaceMap {
         Ok(at)
     }
 
-    /// Writes the tile that was not used for longest to the scratch file, if it changed; its place is free then.
+    /// Puts the tile aside that was not used for longest; says its place.
     fn put_oldest_aside(&mut self) -> Result<usize> {
         let oldest = (0..self.tiles.len()).min_by_key(|at| self.tiles[*at].used).unwrap_or(0);
-        let tile = &self.tiles[oldest];
+        self.put_aside(oldest)?;
+        Ok(oldest)
+    }
+
+    /// Writes a tile to the scratch file, if it changed; its place is free then.
+    fn put_aside(&mut self, at: usize) -> Result<()> {
+        let tile = &self.tiles[at];
         if tile.dirty {
             let next = self.slots.len() as u64;
             let slot = *self.slots.entry(tile.index).or_insert(next);
@@ -380,7 +365,21 @@ impl SurfaceMap {
             self.changed.insert(tile.index);
         }
         self.places.remove(&tile.index);
-        Ok(oldest)
+        Ok(())
+    }
+
+    /// Some rows of a tile in the scratch file, without what they weigh.
+    fn read_rows(&self, slot: u64, rows: Range<usize>) -> Result<TileRows> {
+        let (start, first) = (slot * TILE_BYTES as u64, (rows.start * TILE_SIDE_PX * 4) as u64);
+        let mut bytes = vec![0; rows.len() * TILE_SIDE_PX * 4];
+        let mut read = |at: u64| {
+            let done = self.scratch.read_exact_at(&mut bytes, at);
+            done.map_err(|e| Error::io(&self.scratch_path, e))?;
+            Ok::<_, Error>(bytes.chunks_exact(4).map(|b| [b[0], b[1], b[2], b[3]]).collect::<Vec<[u8; 4]>>())
+        };
+        let depth_mm = read(start + first)?.into_iter().map(f32::from_le_bytes).collect();
+        let texture = read(start + 2 * TILE_PX as u64 * 4 + first)?;
+        Ok(TileRows { first: rows.start, depth_mm, texture })
     }
 
     fn read_tile(&self, slot: u64) -> Result<Tile> {
@@ -404,18 +403,48 @@ impl SurfaceMap {
     }
 }
 
+/// Some rows of a tile.
+struct TileRows {
+    first: usize,
+    depth_mm: Vec<f32>,
+    texture: Vec<[u8; 4]>,
+}
+
+/// The same, lent.
+struct TileView<'a> {
+    first_row: usize,
+    depth_mm: &'a [f32],
+    texture: &'a [[u8; 4]],
+}
+
+impl TileRows {
+    fn view(&self) -> TileView<'_> {
+        TileView { first_row: self.first, depth_mm: &self.depth_mm, texture: &self.texture }
+    }
+}
+
 impl Tile {
+    fn rows(&self) -> TileView<'_> {
+        TileView { first_row: 0, depth_mm: &self.depth_mm, texture: &self.texture }
+    }
+
     fn empty(index: TileIndex) -> Tile {
         Tile {
             index,
             changed: false,
             depth_mm: vec![f32::NAN; TILE_PX],
-            weight: vec![0.0; TILE_PX],
-            texture: vec![[0; 4]; TILE_PX],
+            weight: written(0.0, TILE_PX),
+            texture: written([0; 4], TILE_PX),
             used: 0,
             dirty: false,
         }
     }
+}
+
+/// Cells of one value, written here. What `vec![0.0; cells]` gives is memory that the system zeroes when it is touched: where
+/// sums are read before they are written, each page costs two faults, and the second interrupts all cores.
+pub(crate) fn written<T: Copy>(value: T, cells: usize) -> Vec<T> {
+    std::iter::repeat_n(value, cells).collect()
 }
 
 /// The tile of a grid pixel and the pixel's place in it.
@@ -426,15 +455,17 @@ fn place(column: i64, row: i64) -> (TileIndex, usize) {
 }
 
 /// Copies the part of a tile that lies in the window; `offset` is the tile's corner in the window.
-fn copy_part(tile: &Tile, offset: (i64, i64), window: &mut MapWindow) {
+fn copy_part(tile: TileView<'_>, offset: (i64, i64), window: &mut MapWindow) {
     let side = TILE_SIDE_PX as i64;
+    let columns = offset.0.max(0)..(offset.0 + side).min(window.width_px as i64);
+    let count = (columns.end - columns.start).max(0) as usize;
     for row in offset.1.max(0)..(offset.1 + side).min(window.height_px as i64) {
-        for column in offset.0.max(0)..(offset.0 + side).min(window.width_px as i64) {
-            let from = ((row - offset.1) * side + column - offset.0) as usize;
-            let to = row as usize * window.width_px + column as usize;
-            window.depth_mm[to] = tile.depth_mm[from];
-            let [red, green, blue, there] = tile.texture[from];
-            window.texture[to] = (there != 0).then_some([red, green, blue]);
+        let from = ((row - offset.1 - tile.first_row as i64) * side + columns.start - offset.0) as usize;
+        let to = row as usize * window.width_px + columns.start as usize;
+        window.depth_mm[to..to + count].copy_from_slice(&tile.depth_mm[from..from + count]);
+        let colours = &tile.texture[from..from + count];
+        for (colour, [red, green, blue, there]) in window.texture[to..to + count].iter_mut().zip(colours) {
+            *colour = (*there != 0).then_some([*red, *green, *blue]);
         }
     }
 }
@@ -470,6 +501,42 @@ mod tests {
         }
         assert_eq!(map.measured, 3 * 3700);
         assert!(map.tiles.len() <= 4);
+        // Finished, nothing of it is in memory, and all of it can be read: whole, in bands of some rows, in narrow pieces.
+        let same = |a: &MapWindow, at: usize, b: &MapWindow, from: usize, count: usize| {
+            let bits =
+                |w: &MapWindow, at: usize| w.depth_mm[at..at + count].iter().map(|z| z.to_bits()).collect::<Vec<_>>();
+            bits(a, at) == bits(b, from) && a.texture[at..at + count] == b.texture[from..from + count]
+        };
+        let mut finished = map.finished().expect("put aside").expect("measured");
+        assert!(finished.map.tiles.is_empty());
+        for (column, row, width, height) in
+            [(0, 0, 3700, 304), (100, 1, 3000, 64), (5, 250, 300, 54), (1020, 0, 7, 304)]
+        {
+            let piece = finished.window(column, row, width, height).expect("window");
+            for line in 0..height {
+                assert!(
+                    same(&piece, line * width, &window, (row + line) * 3700 + column, width),
+                    "{column} {row} {line}"
+                );
+            }
+        }
+    }
+
+    #[test]
+    fn what_would_make_the_map_too_large_is_left_out_and_counted() {
+        let mut map = map(4).limited(MapLimits { rows: 1000, pixels: 1_000_000 });
+        for row in [0, 999, 1000, -1, i64::MIN, i64::MAX] {
+            map.put_depth(0, row, 1.0).expect("put");
+        }
+        let cells = [Cell { depth_mm: 1.0, weight: 1.0, rgb: None }; 3];
+        for column in [997, 998, -1, i64::MIN] {
+            map.blend_run(column, 500, &cells).expect("put");
+        }
+        map.put_texture(5, 1000, [1; 3], true).expect("put");
+        let geometry = map.geometry().expect("measured");
+        assert_eq!((geometry.width_px, geometry.height_px), (1000, 1000));
+        assert_eq!((map.measured, map.left_out()), (2 + 3, 4 + 3));
+        assert!(map.slots.is_empty(), "nothing was put anywhere else");
     }
 
     #[test]

@@ -3,7 +3,10 @@
 mod archiving;
 mod colours;
 mod folder;
+mod growing_map;
+mod late;
 mod laz;
+mod maps;
 mod metric;
 mod paper;
 mod poses;
@@ -15,7 +18,6 @@ mod recent;
 
 use std::collections::BTreeMap;
 use std::path::PathBuf;
-use std::sync::Arc;
 use std::time::{Duration, Instant};
 
 use nalgebra::Point3;
@@ -272,7 +274,8 @@ struct Newest {
 
 /// A frame as the recording shows it.
 struct Picture {
-    image: Arc<Image>,
+    /// Whole, or small where nothing else is shown of it.
+    image: Image,
     effective_area: Option<Vec<u8>>,
     row_threshold: Option<Vec<f32>>,
 }
@@ -310,6 +313,13 @@ impl Timings {
         let result = work();
         self.add(stage, start.elapsed());
         result
+    }
+
+    /// Adds what another thread took.
+    fn merge(&mut self, other: Timings) {
+        for (stage, time_s) in other.stages {
+            *self.stages.entry(stage).or_default() += time_s;
+        }
     }
 
     fn add(&mut self, stage: &str, time: Duration) {

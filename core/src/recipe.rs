@@ -166,11 +166,11 @@ recipe! {
         contrast_min: f64 = 6.0, "of 255", number(0.0, 255.0);
         /// Shortest continuous piece of the line that is believed.
         piece_min_rows: u32 = 12, "rows", whole(1, 1000);
-        /// Divide the line's light by the same strip of wall as an earlier frame saw it without the laser.
+        /// Divide the line's light by the same strip of wall as another frame saw it without the laser.
         wall_reference: bool = true, "", flag();
         /// Change of the line's slope from one row to the next that the smoothing along the line expects. Smaller is
         /// smoother; a very rough wall wants more.
-        bend_px: f64 = 0.001, "px a row", number(0.00001, 1.0);
+        bend_px: f64 = 0.004, "px a row", number(0.00001, 1.0);
         /// Rows that are less sure than this are left out.
         sigma_max_px: f64 = 1.0, "px", number(0.01, 100.0);
     }
@@ -305,10 +305,16 @@ recipe! {
         /// Longest time between two live segments.
         segment_s: f64 = 1.0, "s", number(0.1, 60.0);
     }
-    /// Limits of what a source may ask for.
+    /// Limits of what a source may ask for, and of what is made of it.
     limits: LimitOptions {
         /// Most frames of one run: five hours at 60 frames a second.
         max_frames: u32 = 1_080_000, "frames", whole(1, 100_000_000);
+        /// Most rows of a map: 16 m of a wall half a metre away. What the motion lays further apart is left out of the maps
+        /// with a warning, and stays in the cloud.
+        map_rows: u32 = 32_768, "px", whole(256, 65_535);
+        /// Most pixels of a map, the empty ones between its parts included: 5 km of a wall 1 m high in pixels of 0.5 mm.
+        /// What lies beyond is left out of the maps with a warning, and stays in the cloud.
+        map_megapixels: u32 = 20_000, "million", whole(1, 1_000_000);
     }
 }
 

@@ -30,6 +30,7 @@ use jpeg_encoder::ColorType;
 use nalgebra::Point3;
 use rerun::{EncodedImage, Points3D, StoreId, StoreKind, TextDocument, TextLog, ViewCoordinates};
 
+pub use self::images::shrink;
 pub use self::store::Segment;
 pub use self::stretches::Recordings;
 
@@ -108,9 +109,9 @@ pub struct FrameSteps<'a> {
     pub frame_index: u32,
     /// Capture time since the run's first frame, s.
     pub time_s: f64,
-    /// The frame.
+    /// The frame: whole, or as [`shrink`] says where there is neither of the two that follow.
     pub image: Option<&'a Image>,
-    /// The effective area: 255 where the line may be, 0 elsewhere; a value a pixel of `image`.
+    /// The effective area: 255 where the line may be, 0 elsewhere; a value a pixel of the whole frame.
     pub effective_area: Option<&'a [u8]>,
     /// The threshold of each line position, gray value 0 to 255; NaN where there was none.
     pub row_threshold: Option<&'a [f32]>,

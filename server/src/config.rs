@@ -22,7 +22,7 @@ pub struct Config {
     pub workers: usize,
     /// Who is let in.
     pub doors: Doors,
-    /// How long runs are kept.
+    /// How long runs are kept, where nobody stored other rules.
     pub retention: Policy,
     /// Limits of requests.
     pub requests: RequestLimits,
@@ -69,6 +69,11 @@ impl Places {
     /// Uploads that are still coming in.
     pub fn incoming(&self) -> PathBuf {
         self.folder.join("incoming")
+    }
+
+    /// Maps of the differences between runs, while a server keeps them.
+    pub fn changes(&self) -> PathBuf {
+        self.folder.join("changes")
     }
 
     /// What attempts write before it is published.

@@ -27,7 +27,7 @@ pub use place::DatabasePlace;
 use crate::error::{Error, Result};
 
 /// The migrations in order; the schema's version is the number of those that ran.
-const MIGRATIONS: [&str; 7] = [
+const MIGRATIONS: [&str; 8] = [
     include_str!("migrations/0001_records.sql"),
     include_str!("migrations/0002_job_order.sql"),
     include_str!("migrations/0003_arrivals.sql"),
@@ -35,6 +35,7 @@ const MIGRATIONS: [&str; 7] = [
     include_str!("migrations/0005_batches.sql"),
     include_str!("migrations/0006_pins.sql"),
     include_str!("migrations/0007_defects.sql"),
+    include_str!("migrations/0008_retention.sql"),
 ];
 
 /// The version of the schema that this Stria makes.

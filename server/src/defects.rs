@@ -42,19 +42,31 @@ impl Defects {
         found.ok_or_else(|| missing(id))
     }
 
-    /// Changes what people say about a defect. `who` is written down with it.
-    pub async fn change(&self, id: &str, change: DefectChange, who: &str) -> Result<wire::Defect> {
-        retried(ANSWER_PATIENCE, || self.try_change(id, &change, who)).await
+    /// Changes what people say about a defect, where it still has one of these versions; any will do where nothing is
+    /// said. `who` is written down with it.
+    pub async fn change(
+        &self,
+        id: &str,
+        change: DefectChange,
+        versions: Option<&[String]>,
+        who: &str,
+    ) -> Result<wire::Defect> {
+        retried(ANSWER_PATIENCE, || self.try_change(id, &change, versions, who)).await
     }
 
-    async fn try_change(&self, id: &str, change: &DefectChange, who: &str) -> Result<wire::Defect> {
+    async fn try_change(
+        &self,
+        id: &str,
+        change: &DefectChange,
+        versions: Option<&[String]>,
+        who: &str,
+    ) -> Result<wire::Defect> {
         let t = self.db.write().await?;
         let row = defect::Entity::find_by_id(id).lock_exclusive().one(&*t).await?.ok_or_else(|| missing(id))?;
-        if let Some(version) = change.version
-            && version != row.version
-        {
-            let found = format!("it has version {}, not {version}: somebody else has changed it", row.version);
-            return Err(Error::Conflict(found));
+        if versions.is_some_and(|versions| !versions.contains(&row.version.to_string())) {
+            let found =
+                format!("somebody else has changed the defect since it was read: it has version {}", row.version);
+            return Err(Error::Changed(found));
         }
         let mut set = defect::ActiveModel {
             id: Set(row.id),
@@ -114,7 +126,7 @@ fn defect_of(row: defect::Model) -> Result<wire::Defect> {
         at_edge: row.at_edge != 0,
         state,
         comment: row.comment,
-        version: row.version,
+        version: row.version.to_string(),
         changed_at: row.changed_ms.map(to_text),
         changed_by: row.changed_by,
         carried_from: row.carried_from,

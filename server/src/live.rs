@@ -12,8 +12,8 @@ use std::sync::Arc;
 use bytes::Bytes;
 use sea_orm::sea_query::Expr;
 use sea_orm::{
-    ActiveValue::Set, ColumnTrait, Condition, ConnectionTrait, EntityTrait, ExprTrait, QueryFilter, QueryOrder,
-    QuerySelect,
+    ActiveModelTrait, ActiveValue::Set, ColumnTrait, Condition, ConnectionTrait, EntityTrait, ExprTrait, QueryFilter,
+    QueryOrder, QuerySelect,
 };
 use sha2_resumable::Sha256;
 use sha2_resumable::digest::Digest;
@@ -162,8 +162,13 @@ impl Live {
             hash_state: String::new(),
             opened_ms: now_ms(),
         };
-        stream::Entity::delete_by_id(&row.name).exec(&*t).await?;
-        stream::Entity::insert(stream::ActiveModel::from(row.clone())).exec_without_returning(&*t).await?;
+        let record = stream::ActiveModel::from(row.clone());
+        if before.is_some() {
+            stream::Entity::update(record.reset_all()).exec(&*t).await?;
+        } else {
+            // A row that another server made since nobody had one is not ours to replace: this fails, and is tried again.
+            stream::Entity::insert(record).exec_without_returning(&*t).await?;
+        }
         t.commit().await?;
         Ok(row)
     }
@@ -407,6 +412,7 @@ impl Connection {
     fn mine(&self) -> Condition {
         Condition::all()
             .add(stream::Column::Name.eq(&self.row.name))
+            .add(stream::Column::RunId.eq(&self.row.run_id))
             .add(stream::Column::Fence.eq(self.row.fence))
             .add(stream::Column::IsOpen.eq(1))
     }

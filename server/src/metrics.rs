@@ -76,6 +76,8 @@ pub struct Metrics {
     pub wait_s: Histogram,
     /// Leases that this process took from a silent worker.
     pub leases_lost: Counter,
+    /// Changes that other processes told of.
+    pub rings_heard: Counter,
     /// 1 where the processes that decode videos are kept from it, 0 where this system does not allow that.
     pub fences: Family<Fence, Gauge>,
     queue_jobs: Family<Waiting, Gauge>,
@@ -103,6 +105,7 @@ impl Metrics {
             stage_s: Family::new_with_constructor(|| Histogram::new(SECONDS)),
             wait_s: Histogram::new(SECONDS),
             leases_lost: Counter::default(),
+            rings_heard: Counter::default(),
             fences: Family::default(),
             queue_jobs: Family::default(),
             queue_oldest_s: Family::default(),
@@ -119,6 +122,7 @@ impl Metrics {
         r.register("stage_seconds", "Time of finished jobs by stage", m.stage_s.clone());
         r.register("wait_seconds", "Time between enqueue and claim", m.wait_s.clone());
         r.register("leases_lost", "Leases taken from silent workers", m.leases_lost.clone());
+        r.register("rings_heard", "Changes that other processes on the same PostgreSQL told of", m.rings_heard.clone());
         r.register("fences", "1 where children are kept from it, 0 where the system cannot", m.fences.clone());
         r.register("queue_jobs", "Jobs that wait or run", m.queue_jobs.clone());
         r.register("queue_oldest_seconds", "Age of the oldest job that waits or runs", m.queue_oldest_s.clone());

@@ -1,10 +1,12 @@
 //! Jobs as leased rows: enqueue, claim, cancel, retry; `queue/lease.rs` holds what the owner of a lease may write
-//! while it works, `queue/ending.rs` its one end, `queue/lost.rs` finds leases whose worker is gone.
+//! while it works, `queue/ending.rs` its one end, `queue/lost.rs` finds leases whose worker is gone,
+//! `queue/bell.rs` wakes whoever waits for a change.
 //!
 //! Invariants: a claim and everything that goes with it is one transaction. Every write of a worker carries the
 //! lease's fence, so that a worker that was paused past its lease writes nothing. One transaction publishes exactly
 //! one result. The state of a run's latest job is repeated in the run's row in the same transaction.
 
+mod bell;
 mod ending;
 mod lease;
 mod lost;
@@ -14,9 +16,9 @@ use sea_orm::sea_query::{Expr, LockBehavior, LockType, OnConflict};
 use sea_orm::{
     ActiveValue::Set, ColumnTrait, Condition, ConnectionTrait, EntityTrait, QueryFilter, QueryOrder, QuerySelect,
 };
-use tokio::sync::watch;
 use uuid::Uuid;
 
+pub use bell::Bell;
 pub use ending::{Outcome, PublishedProduct};
 pub use lease::{Lease, Progress, Signal};
 pub use lost::LeaseWatch;
@@ -45,33 +47,6 @@ fn rank_ms(created_ms: i64, priority: Priority) -> i64 {
 
 /// Store keys of an attempt that still runs are due for deletion at no time.
 const HELD_MS: i64 = i64::MAX;
-
-/// Wakes whoever waits for a change in this process. The records are the truth; the bell only saves waiting.
-#[derive(Clone)]
-pub struct Bell(watch::Sender<u64>);
-
-impl Bell {
-    /// A new bell.
-    pub fn new() -> Bell {
-        Bell(watch::Sender::new(0))
-    }
-
-    /// Something changed.
-    pub fn ring(&self) {
-        self.0.send_modify(|n| *n = n.wrapping_add(1));
-    }
-
-    /// Hears every ring from now on, several at once as one.
-    pub fn listen(&self) -> watch::Receiver<u64> {
-        self.0.subscribe()
-    }
-}
-
-impl Default for Bell {
-    fn default() -> Self {
-        Bell::new()
-    }
-}
 
 /// Which jobs a worker takes.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]

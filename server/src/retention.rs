@@ -2,6 +2,7 @@
 //! never recorded; idempotency keys past their time. It deletes only what the records name.
 
 mod policy;
+mod rules;
 
 use std::time::Duration;
 
@@ -9,6 +10,7 @@ use sea_orm::{ColumnTrait, EntityTrait, QueryFilter, QueryOrder, QuerySelect};
 use tokio_util::sync::CancellationToken;
 
 pub use policy::{Going, Policy, set_pin};
+pub use rules::{Holding, MOST_DAYS, MOST_GB, store as store_rules};
 
 use crate::auth::Auth;
 use crate::db::Db;
@@ -31,20 +33,12 @@ const AT_ONCE: u64 = 100;
 /// How long a creating request can be repeated with its key.
 const KEYS_KEPT_MS: i64 = 30 * 24 * 3_600_000;
 
-/// Looks again and again until asked to stop.
+/// Looks again and again until asked to stop. `own` are this server's rules of keeping, where nobody stored others.
 #[allow(clippy::too_many_arguments)] // One task that keeps house for all of them.
-pub async fn run(
-    db: Db,
-    store: Store,
-    uploads: Uploads,
-    runs: Runs,
-    policy: Policy,
-    bell: Bell,
-    stop: CancellationToken,
-) {
+pub async fn run(db: Db, store: Store, uploads: Uploads, runs: Runs, own: Policy, bell: Bell, stop: CancellationToken) {
     let mut changes = bell.listen();
     let mut forgot: Option<std::time::Instant> = None;
-    let mut let_go: Option<std::time::Instant> = None;
+    let mut let_go: Option<(std::time::Instant, i64)> = None;
     loop {
         let swept = async {
             // First: it goes on with files that may be due here.
@@ -60,11 +54,17 @@ pub async fn run(
                 tracing::warn!(%error, "what is over could not be forgotten; it will be tried again");
             }
         }
-        if let_go.is_none_or(|at| at.elapsed() >= policy::EVERY) {
-            let_go = Some(std::time::Instant::now());
-            if let Err(error) = apply(&db, &runs, &policy).await {
-                tracing::warn!(%error, "what the policy does not keep could not be deleted; it will be tried again");
+        let applied = async {
+            let holding = Holding::now(&db, own).await?;
+            let due = let_go.is_none_or(|(at, version)| at.elapsed() >= policy::EVERY || version != holding.version);
+            if due {
+                let_go = Some((std::time::Instant::now(), holding.version));
+                apply(&db, &runs, own, &holding).await?;
             }
+            Ok::<(), Error>(())
+        };
+        if let Err(error) = applied.await {
+            tracing::warn!(%error, "what the rules do not keep could not be deleted; it will be tried again");
         }
         let pause = async {
             tokio::time::sleep(AT_MOST_EVERY).await;
@@ -77,12 +77,21 @@ pub async fn run(
     }
 }
 
-/// Deletes what the policy does not keep; the log says each run.
-async fn apply(db: &Db, runs: &Runs, policy: &Policy) -> Result<()> {
-    for going in policy.going(db).await? {
+/// Deletes what the rules do not keep; the log says each run. Stops where other rules hold by then, and leaves what was
+/// pinned meanwhile.
+async fn apply(db: &Db, runs: &Runs, own: Policy, holding: &Holding) -> Result<()> {
+    for going in holding.policy.going(db).await? {
         let Going { run, asset, bytes, reason, .. } = going;
-        match runs.delete(&run).await {
+        if Holding::now(db, own).await?.version != holding.version {
+            return Ok(());
+        }
+        match runs.is_pinned(&run).await {
+            Ok(false) => {}
             // Another server was first, or someone.
+            Ok(true) | Err(Error::NotFound { .. }) => continue,
+            Err(error) => return Err(error),
+        }
+        match runs.delete(&run).await {
             Err(Error::NotFound { .. }) => {}
             other => other?,
         }

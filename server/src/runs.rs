@@ -20,7 +20,7 @@ use crate::defects;
 use crate::error::{Error, Result};
 use crate::incoming::Incoming;
 use crate::queue::{self, NewJob, Queue};
-use crate::retention::{self, Policy};
+use crate::retention::{self, Holding, Policy};
 use crate::source;
 use crate::store::{self, Facts, Key, Store};
 use crate::wire::time::{from_text, now_ms, to_text};
@@ -413,9 +413,22 @@ impl Runs {
         Ok(())
     }
 
-    /// What a policy would delete now.
-    pub async fn preview(&self, policy: &Policy) -> Result<wire::RetentionPreview> {
-        policy.preview(&self.db).await
+    /// What a policy would delete now, and the rules that hold on a server with flags `own`.
+    pub async fn preview(&self, policy: &Policy, own: Policy) -> Result<wire::RetentionPreview> {
+        let rules = self.rules_of_keeping(own).await?.wire(own);
+        policy.preview(&self.db, rules).await
+    }
+
+    /// The rules of keeping that hold on a server with flags `own`.
+    pub async fn rules_of_keeping(&self, own: Policy) -> Result<Holding> {
+        Holding::now(&self.db, own).await
+    }
+
+    /// Stores rules of keeping for every server; `None`: each server's own hold again. `versions` as for [`Runs::change`].
+    pub async fn keep_by(&self, rules: Option<Policy>, versions: Option<&[String]>, who: &str) -> Result<()> {
+        retention::store_rules(&self.db, rules, versions, who).await?;
+        self.queue.bell().ring();
+        Ok(())
     }
 
     /// Keeps a run whatever the policy says, or not.

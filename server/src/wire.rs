@@ -27,7 +27,7 @@ pub use lists::{
 };
 pub use live::{LiveEnded, LiveStream, LiveStreamPage};
 pub use measure::{CrossSection, Trajectory};
-pub use retention::{Doomed, Pin, RetentionPreview};
+pub use retention::{Doomed, Pin, RetentionPreview, RetentionRules, RetentionWish, RulesOrigin};
 pub use run::{Direction, Run, RunChange, RunSource};
 
 use serde::{Deserialize, Serialize};

@@ -92,8 +92,12 @@ fn jobs_done(port: u16) -> u64 {
     assert_eq!(ask("/api/runs").status(), 404, "a worker has no other doors");
     let metrics = ask("/metrics").text().expect("text");
     assert!(metrics.ends_with("# EOF\n") && metrics.contains("stria_queue_jobs"), "{metrics}");
-    let done = metrics.lines().find_map(|line| line.strip_prefix("stria_attempts_total{end=\"done\"} "));
-    done.map_or(0, |number| number.parse().expect("a number"))
+    let count = |name: &str| {
+        let number = metrics.lines().find_map(|line| line.strip_prefix(name));
+        number.map_or(0, |number| number.trim().parse().expect("a number"))
+    };
+    assert!(count("stria_rings_heard_total ") > 0, "the servers' changes are heard, not only found: {metrics}");
+    count("stria_attempts_total{end=\"done\"} ")
 }
 
 fn slots(workers: &[Value]) -> u64 {

@@ -2,12 +2,14 @@
 
 use std::io::{BufRead, BufReader};
 use std::process::{Child, Command, Stdio};
-use std::time::{Duration, Instant};
 
 use serde_json::Value;
 use stria_tests::support::cluster::Cluster;
 use stria_tests::support::server::{Server, header, send, text};
 use stria_tests::support::{Run, eventually, form, long_run};
+
+/// Longer than any test.
+const ENDLESSLY: u32 = 10_000;
 
 /// ffmpeg sends the run at the pace at which it was recorded, `times` over.
 fn robot(server: &Server, run: &Run, times: u32) -> Child {
@@ -67,33 +69,71 @@ fn a_live_run_is_watched_through_the_other_server() {
     assert_eq!(done["frames"].as_u64(), stream(&a)["frames"].as_u64(), "{done:#}");
 }
 
+/// Whoever begins a run has looked whether the stream is open already, and waits here for the others.
+const MEET: &str = "CREATE FUNCTION meet() RETURNS trigger LANGUAGE plpgsql AS \
+    'BEGIN PERFORM pg_advisory_xact_lock(7); RETURN NEW; END'; \
+    CREATE TRIGGER meet BEFORE INSERT ON runs FOR EACH ROW EXECUTE FUNCTION meet()";
+/// The lock's number in it.
+const MEETING: u32 = 7;
+
 #[test]
 fn two_servers_that_race_for_a_stream_leave_it_to_one() {
     let cluster = Cluster::start();
-    let come_back = ["--workers", "0", "--live-come-back-s", "2"];
-    let (a, b) = (cluster.server(&come_back), cluster.server(&come_back));
+    // Long enough that a robot on a busy machine is not taken for one that is gone.
+    let come_back = ["--workers", "0", "--live-come-back-s", "8"];
+    let servers = [cluster.server(&come_back), cluster.server(&come_back)];
+    let [a, b] = &servers;
     let _worker = cluster.worker(&["--slots", "1"]);
-    // Both at once: whichever comes later takes the stream over, and the other one is told so.
-    let mut robots = [robot(&a, long_run(), 2), robot(&b, long_run(), 2)];
-    let begun = Instant::now();
-    let mut fences = Vec::new();
-    while robots.iter_mut().any(|robot| robot.try_wait().expect("it can be waited for").is_none()) {
-        assert!(begun.elapsed() < Duration::from_secs(60), "the senders hang");
+    cluster.ask(MEET);
+    // Both find no open stream, and only then may go on, one after the other: whichever comes later takes the stream over,
+    // and the other one is told so. Who is turned away because the machine is busy comes again.
+    let gate = cluster.hold(MEETING);
+    let mut robots = [robot(a, long_run(), ENDLESSLY), robot(b, long_run(), ENDLESSLY)];
+    let come_again = |robots: &mut [Child; 2]| {
+        for (server, walking) in servers.iter().zip(robots) {
+            if walking.try_wait().expect("it can be waited for").is_some() {
+                *walking = robot(server, long_run(), ENDLESSLY);
+            }
+        }
+    };
+    eventually("both servers are about to begin the run", || {
+        come_again(&mut robots);
+        // One waits at the gate, the other there too, or for the first (both make the asset).
+        cluster.ask("SELECT count(*) FROM pg_locks WHERE NOT granted") == ["2"]
+    });
+    drop(gate);
+    let mut fences: Vec<i64> = Vec::new();
+    let mut look = || {
         let open = cluster.ask("SELECT count(*) FROM streams WHERE is_open <> 0");
         assert!(open == ["0"] || open == ["1"], "{open:?}");
         fences.extend(cluster.ask("SELECT fence FROM streams").iter().filter_map(|f| f.parse::<i64>().ok()));
-        std::thread::sleep(Duration::from_millis(100));
+        fences.last().copied()
+    };
+    eventually("one takes over from the other", || {
+        let taken_over = look().is_some_and(|fence| fence >= 2);
+        if !taken_over {
+            come_again(&mut robots);
+        }
+        taken_over
+    });
+    eventually("the other is told so", || {
+        look();
+        robots.iter_mut().any(|walking| walking.try_wait().expect("it can be waited for").is_some())
+    });
+    for walking in &mut robots {
+        let _ = walking.kill();
+        walking.wait().expect("it ends");
     }
+    look();
     assert!(fences.windows(2).all(|pair| pair[0] <= pair[1]), "an older owner came back: {fences:?}");
-    assert!(fences.last().is_some_and(|fence| *fence >= 2), "nobody took anything over: {fences:?}");
-    eventually("the run is closed, by either server", || stream(&a)["open"] == false);
+    eventually("the run is closed, by either server", || stream(a)["open"] == false);
     // Segments are numbered without a gap or a second one of any number, and what is in the records is what the job read.
     let runs = cluster.ask("SELECT id FROM runs");
     assert_eq!(runs.len(), 1, "one robot, one run: {runs:?}");
     let numbers = cluster.ask("SELECT number FROM source_segments ORDER BY number");
     let expected: Vec<String> = (0..numbers.len()).map(|n| n.to_string()).collect();
     assert_eq!(numbers, expected);
-    let (by_a, by_b) = (stream(&a), stream(&b));
+    let (by_a, by_b) = (stream(a), stream(b));
     assert_eq!(by_a, by_b, "both tell the same");
     let done = b.wait_for_state(&text(&by_b, "/job"), "done");
     assert_eq!(done["frames"], by_b["frames"], "{done:#}");

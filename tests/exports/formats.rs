@@ -4,6 +4,7 @@ use std::path::{Path, PathBuf};
 use std::sync::OnceLock;
 
 use serde_json::Value;
+use stria_core::export::cloud_ply;
 use stria_core::export::manifest::{Manifest, sha256_of_file};
 use stria_tests::support::readers::{read, read_with_node};
 use stria_tests::support::server::{Server, problem_of, send, text as field};
@@ -82,6 +83,35 @@ fn a_folder_s_products_in_every_format() {
     assert!(here.path().join("products.tif").exists());
 }
 
+/// Chainages that a part of the cloud lies between, and of so many points one.
+const PART_MM: [f64; 2] = [1150.0, 1250.0];
+const EVERY: usize = 3;
+
+/// A part of the cloud is the same in every format: the run's own points between two chainages.
+fn check_part(from: &str, more: &[&str], formats: &[&str], start_mm: f64) {
+    let folder = tempfile::tempdir().expect("a folder");
+    let [a, b] = PART_MM.map(|mm| (mm - 1000.0 + start_mm).to_string());
+    let (path, every) = (|format: &str| folder.path().join(format!("wall.{format}")), EVERY.to_string());
+    for format in formats {
+        let part = ["--from-mm", &a, "--to-mm", &b, "--every", &every];
+        let done = export(from, format, &path(format), &[&part[..], more].concat());
+        assert!(done.status.success(), "{format}: {}", said(&done));
+    }
+    let whole = cloud_ply::read(&products().join("cloud.ply")).expect("a cloud");
+    let inside = whole.iter().filter(|p| (PART_MM[0] - 1000.0..=PART_MM[1] - 1000.0).contains(&p.point_in_world.x));
+    let expected: Vec<_> = inside.step_by(EVERY).copied().collect();
+    assert!((1000..whole.len() / 3).contains(&expected.len()), "{} points", expected.len());
+    assert_eq!(cloud_ply::read(&path("ply")).expect("a cloud"), expected);
+    if formats.len() == 4 {
+        assert_eq!(read("same_cloud.py", &[folder.path()]), expected.len());
+    }
+}
+
+#[test]
+fn a_part_of_the_cloud_in_every_format() {
+    check_part(text(products()), &["--chainage-mm", "1000"], &["ply", "laz", "pcd", "e57"], 1000.0);
+}
+
 #[test]
 fn a_server_s_job_in_every_format() {
     let server = Server::start(&["--workers", "1"]);
@@ -90,6 +120,7 @@ fn a_server_s_job_in_every_format() {
     server.wait_for_state(&job, "done");
     let url = server.url("");
     check(&job, &["--server", &url]);
+    check_part(&job, &["--server", &url], &["ply"], 0.0);
 
     let unknown = export("no-such-job", "ply", Path::new("none.ply"), &["--server", &url]);
     assert_eq!(unknown.status.code(), Some(2), "{}", said(&unknown));
@@ -136,7 +167,8 @@ fn what_cannot_be_exported_is_said() {
     let out = folder.path().join("out");
     for (format, more, expected) in [
         ("stl", &[][..], "mcap"),
-        ("ply", &["--every", "2"], "--every is for --format mcap"),
+        ("glb", &["--every", "2"], "--every is for --format mcap"),
+        ("pcd", &["--from-mm", "900000"], "no point there"),
         ("csv", &[], "--at-mm or --line"),
         ("csv", &["--line", "1,2,3"], "four numbers"),
         ("csv", &["--at-mm", "999999"], "beside the map"),

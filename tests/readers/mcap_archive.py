@@ -99,7 +99,7 @@ def stamps(message):
 
 
 def describe(topic, message):
-    if topic in ("/surface", "/profile"):
+    if topic in ("/surface", "/surface/overview", "/profile"):
         return cloud(message)
     if topic == "/defects":
         return scene(message)
@@ -107,7 +107,7 @@ def describe(topic, message):
         return image32(message)
     if topic.startswith("/depth_map"):
         return grid(message)
-    if topic == "/tf":
+    if topic in ("/tf", "/tf_static"):
         (transform,) = message.transforms
         t, r = transform.translation, transform.rotation
         return {

@@ -116,11 +116,12 @@ fn whole_file(read: &Value) {
     assert_eq!(read["statistics"]["chunks"], read["file"]["chunks"]);
     assert_eq!(read["statistics"]["start_ns"], START_NS);
     assert_eq!(read["statistics"]["end_ns"], time_ns(u64::from(FRAMES) - 1));
-    assert_eq!(read["statistics"]["messages"], 4 * FRAMES + 3 + 2);
+    assert_eq!(read["statistics"]["messages"], 4 * FRAMES + 3 + 4);
     for (name, topic) in read["topics"].as_object().expect("topics") {
         let times = array(&topic["times_ns"]);
         let expected: Vec<Value> = match name.as_str() {
-            "/camera/calibration" => vec![json!(START_NS)],
+            "/camera/calibration" | "/tf_static" => vec![json!(START_NS)],
+            "/surface/overview" => vec![json!(time_ns(u64::from(FRAMES) - 1))],
             "/log" => vec![json!(time_ns(5))],
             // Half a second of the surface in each message, which has its last frame's time.
             "/surface" => [13, 27, 39].map(|i| json!(time_ns(i))).to_vec(),
@@ -152,6 +153,11 @@ fn camera(read: &Value, known: &KnownRun, frames: &[EncodedFrame], video: &Path)
 
 fn results(read: &Value, known: &KnownRun) {
     let topics = &read["topics"];
+    // The world stands upright in rerun's root: its y, which points down, is minus the root's z.
+    let root = &topics["/tf_static"]["of"][0];
+    assert_eq!((&root["parent"], &root["child"]), (&json!("tf#/"), &json!("world")));
+    near(&root["rotation"][0], -std::f64::consts::FRAC_1_SQRT_2, 1e-12);
+    near(&root["rotation"][3], std::f64::consts::FRAC_1_SQRT_2, 1e-12);
     for index in [0, 7, FRAMES - 1] {
         let (frame, at) = (known.frame(index), index as usize);
         let pose = &topics["/tf"]["of"][at];

@@ -110,10 +110,13 @@ fn defects_of_all_runs_are_listed_judged_and_outlive_reprocessing() {
     // What people say, and what two people say at the same time.
     let path = format!("/api/defects/{}", text(&all[0], "/id"));
     let change = |body: Value| server.patch(&path).json(&body);
-    let said = json_of(send(change(json!({"state": "watched", "comment": "=wet, \"again\"", "version": 0}))), 200);
-    assert_eq!((said["version"].as_i64(), text(&said, "/state")), (Some(1), "watched".into()));
+    let seen = format!("\"{}\"", text(&all[0], "/version"));
+    let judged = json!({"state": "watched", "comment": "=wet, \"again\""});
+    let said = json_of(send(change(judged).header("If-Match", &seen)), 200);
+    assert_eq!(text(&said, "/state"), "watched");
     assert!(said["changed_at"].is_string() && said["changed_by"].is_string());
-    problem_of(send(change(json!({"state": "dismissed", "version": 0}))), 409);
+    problem_of(send(change(json!({"state": "dismissed"})).header("If-Match", &seen)), 412);
+    problem_of(send(change(json!({"state": "dismissed", "version": 0}))), 400);
     assert_eq!(server.json(&path), said);
     let problem = problem_of(send(change(json!({"comment": "x".repeat(4001)}))), 400);
     assert_eq!(problem["field"], "comment");
@@ -226,6 +229,22 @@ fn two_runs_of_an_asset_show_what_changed_and_one_defect_over_time() {
     assert!(report["unchanged"].as_array().is_some_and(|u| u.len() > 3));
     assert_eq!(json_of(send(ask(&job(&second), &job(&first))), 200), report, "the same again");
 
+    // The difference as a map, read by a program that we did not write.
+    let map = |before: &str| server.get(&format!("/api/jobs/{}/change/difference.tif?before={before}", job(&second)));
+    let answer = send(map(&job(&first)));
+    assert_eq!((answer.status().as_u16(), header(&answer, "content-type")), (200, "image/tiff".to_string()));
+    let folder = tempfile::tempdir().expect("a temporary folder");
+    let (tif, places) = (folder.path().join("difference.tif"), folder.path().join("places.json"));
+    std::fs::write(&tif, answer.bytes().expect("the file")).expect("written");
+    let at = |change: &Value| json!([number(change, "x_mm"), number(change, "y_mm")]);
+    std::fs::write(&places, json!([at(of("grown")), at(of("new"))]).to_string()).expect("written");
+    let told = read("depth_at.py", &[&tif, &places]);
+    for (told, change) in told.as_array().expect("values").iter().zip([of("grown"), of("new")]) {
+        let told = told.as_f64().expect("measured there");
+        assert!((told - number(change, "delta_depth_mm")).abs() < 1.2, "{told} mm: {change}");
+    }
+    problem_of(send(map("none")), 404);
+
     let problem = problem_of(send(ask(&job(&elsewhere), &job(&first))), 400);
     assert_eq!(problem["field"], "before", "{problem}");
     problem_of(send(ask(&job(&second), "none")), 404);
@@ -234,7 +253,7 @@ fn two_runs_of_an_asset_show_what_changed_and_one_defect_over_time() {
     let turned = server.patch(&format!("/api/runs/{}", text(&second, "/id"))).json(&json!({"direction": "backward"}));
     json_of(send(turned), 200);
     let problem = problem_of(send(ask(&job(&second), &job(&first))), 400);
-    assert!(text(&problem, "/expected").contains("same direction"), "{problem}");
+    assert!(text(&problem, "/expected").contains("same stretch"), "turned, it lies elsewhere: {problem}");
     let back = json!({"direction": "forward", "chainage_mm": 12060});
     json_of(send(server.patch(&format!("/api/runs/{}", text(&second, "/id"))).json(&back)), 200);
 

@@ -1,6 +1,6 @@
 //! What is kept and for how long; copies of everything.
 
-use serde_json::Value;
+use serde_json::{Value, json};
 use stria_tests::support::server::{Server, json_of, problem_of, read, send, text};
 use stria_tests::support::{eventually, files_below, run_stria, short_run};
 
@@ -50,6 +50,65 @@ fn a_policy_tells_beforehand_what_it_deletes_and_pinned_runs_stay() {
     assert_eq!(runs(&server), [old[2].clone(), old[0].clone()]);
     let gone = old[1].clone();
     eventually("its files go too", || !files_below(&server.data().join("store")).iter().any(|f| f.contains(&gone)));
+}
+
+#[test]
+fn rules_stored_by_people_hold_over_the_flags_until_they_are_given_up() {
+    let mut server = Server::start(&["--workers", "1", "--keep-days", "3000"]);
+    let old: Vec<String> = (0..3).map(|_| done_run(&server, "Wall")).collect();
+    json_of(send(server.put(&format!("/api/runs/{}/pin", old[2]))), 200);
+    let first = server.json("/api/retention")["rules"].clone();
+    assert_eq!((text(&first, "/origin"), first["keep_days"].as_f64()), ("server".into(), Some(3000.0)));
+    assert!(first["changed_at"].is_null() && first["changed_by"].is_null(), "{first}");
+
+    // Beforehand: what other rules alone would delete, not those beside the ones that hold.
+    let stored = server.json("/api/retention")["stored_bytes"].as_u64().expect("bytes");
+    let quota_gb = (stored - 1) as f64 / 1e9;
+    let path = format!("/api/retention?exactly=true&quota_gb={quota_gb}");
+    let preview = server.json(&path);
+    assert_eq!((preview["runs"].as_u64(), preview["keep_days"].as_f64()), (Some(1), None));
+    assert_eq!(text(&preview, "/items/0/run"), old[0]);
+    assert_eq!(preview["rules"], first, "asking stores nothing");
+
+    let version = |rules: &Value| format!("\"{}\"", text(rules, "/version"));
+    let put = |body: Value, seen: &str| send(server.put("/api/retention").header("If-Match", seen).json(&body));
+    for (body, field) in [
+        (json!({"keep_days": 0}), "keep_days"),
+        (json!({"keep_days": 1e7}), "keep_days"),
+        (json!({"quota_gb": -3}), "quota_gb"),
+        (json!({"quota_gb": "much"}), "body"),
+        (json!({"keep_weeks": 3}), "body"),
+    ] {
+        let problem = problem_of(put(body.clone(), &version(&first)), 400);
+        assert!(problem["field"] == field && problem["expected"].is_string(), "{body}: {problem}");
+    }
+    problem_of(put(json!({"keep_days": 1}), "\"another\""), 412);
+    assert_eq!(runs(&server).len(), 3);
+
+    let answer = json_of(put(json!({"keep_days": null, "quota_gb": quota_gb}), &version(&first)), 200);
+    let second = answer["rules"].clone();
+    assert_eq!((text(&second, "/origin"), second["keep_days"].as_f64()), ("stored".into(), None));
+    assert_eq!((second["own_keep_days"].as_f64(), second["own_quota_gb"].as_f64()), (Some(3000.0), None));
+    assert!(second["changed_at"].is_string() && second["changed_by"].is_string(), "{second}");
+    problem_of(put(json!({"keep_days": 1}), &version(&first)), 412);
+    eventually("the new rules are applied without a new start", || runs(&server).len() == 2);
+    assert_eq!(runs(&server), [old[2].clone(), old[1].clone()], "the oldest that is not pinned");
+
+    // They outlast the process, whatever its flags say.
+    server.stop();
+    server.start_again();
+    assert_eq!(server.json("/api/retention")["rules"], second);
+    let forget = |seen: &str| send(server.delete("/api/retention").header("If-Match", seen));
+    problem_of(forget(&version(&first)), 412);
+    let third = json_of(forget(&version(&second)), 200)["rules"].clone();
+    assert_eq!((text(&third, "/origin"), third["keep_days"].as_f64()), ("server".into(), Some(3000.0)));
+    assert_ne!(third["version"], second["version"]);
+    assert!(third["changed_at"].is_string(), "since when they hold again: {third}");
+
+    let log = server.json("/api/audit");
+    let deeds = log["items"].as_array().expect("items").iter().filter(|l| text(l, "/path") == "/api/retention");
+    let told: Vec<(String, u64)> = deeds.map(|l| (text(l, "/method"), l["status"].as_u64().expect("status"))).collect();
+    assert!(told.contains(&("PUT".into(), 200)) && told.contains(&("DELETE".into(), 200)), "{told:?}");
 }
 
 /// What people see of a run and its job.

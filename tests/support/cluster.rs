@@ -6,7 +6,7 @@ use std::time::{Duration, Instant};
 
 use tempfile::TempDir;
 
-use super::postgres::Postgres;
+use super::postgres::{Held, Postgres};
 use super::s3::{BUCKET, S3};
 use super::server::{Server, children_of, signal};
 use super::stria;
@@ -54,6 +54,11 @@ impl Cluster {
     /// Asks the records in SQL.
     pub fn ask(&self, sql: &str) -> Vec<String> {
         self.postgres.ask("walls", sql)
+    }
+
+    /// Holds the records' advisory lock of this number until what is returned goes.
+    pub fn hold(&self, lock: u32) -> Held {
+        self.postgres.hold("walls", lock)
     }
 
     /// Where the service's files lie in the bucket's folder.

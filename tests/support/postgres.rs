@@ -1,5 +1,6 @@
 //! A PostgreSQL of a test's own: own folder, own port, not as root. It can be taken away and brought back.
 
+use std::io::{BufRead, BufReader, Write};
 use std::net::TcpListener;
 use std::os::unix::process::CommandExt;
 use std::path::{Path, PathBuf};
@@ -116,6 +117,37 @@ impl Postgres {
         );
         assert!(answer.status.success(), "{sql}: {}", String::from_utf8_lossy(&answer.stderr));
         String::from_utf8_lossy(&answer.stdout).lines().map(Into::into).collect()
+    }
+
+    /// Takes an advisory lock, and holds it until what is returned goes.
+    ///
+    /// # Panics
+    /// Where it is not given.
+    pub fn hold(&self, database: &str, lock: u32) -> Held {
+        let mut session = self
+            .command("psql")
+            .args(["-h", "127.0.0.1", "-p", &self.port.to_string(), "-U", "stria", "-d", database, "-AtX"])
+            .stdin(Stdio::piped())
+            .stdout(Stdio::piped())
+            .spawn()
+            .expect("psql starts");
+        let words = session.stdin.as_mut().expect("it was asked for");
+        writeln!(words, "SELECT 'held' FROM pg_advisory_lock({lock});").expect("psql listens");
+        let mut answer = String::new();
+        BufReader::new(session.stdout.as_mut().expect("it was asked for")).read_line(&mut answer).expect("an answer");
+        assert_eq!(answer.trim(), "held");
+        Held(session)
+    }
+}
+
+/// A session that holds a lock.
+pub struct Held(Child);
+
+impl Drop for Held {
+    fn drop(&mut self) {
+        // Its session ends with its input.
+        drop(self.0.stdin.take());
+        let _ = self.0.wait();
     }
 }
 

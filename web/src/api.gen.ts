@@ -309,10 +309,30 @@ export interface paths {
             cookie?: never;
         };
         /**
-         * What changed from an earlier job to this one: the same asset, the same direction. A comparison that takes longer than
+         * What changed from an earlier job to this one, of the same asset, either way along it. A comparison that takes longer than
          *     some seconds is answered with 202 and goes on; whoever asks again gets it.
          */
         get: operations["get_change"];
+        put?: never;
+        post?: never;
+        delete?: never;
+        options?: never;
+        head?: never;
+        patch?: never;
+        trace?: never;
+    };
+    "/api/jobs/{job}/change/difference.tif": {
+        parameters: {
+            query?: never;
+            header?: never;
+            path?: never;
+            cookie?: never;
+        };
+        /**
+         * The map of that change as a GeoTIFF like `residual.tif`: later less earlier, mm, in the earlier run's world, its slow part
+         *     taken off; NaN where not both measured.
+         */
+        get: operations["get_difference"];
         put?: never;
         post?: never;
         delete?: never;
@@ -625,11 +645,16 @@ export interface paths {
             path?: never;
             cookie?: never;
         };
-        /** What the server's policy, or another, would delete now. Nothing is deleted by asking. */
+        /** The rules of keeping that hold, and what they, or others, would delete now. Nothing is deleted by asking. */
         get: operations["preview_retention"];
-        put?: never;
+        /**
+         * Stores rules of keeping: from now on they hold on every server, whatever its flags say. What they do not keep goes at
+         *     once: GET with `exactly` and the same rules says beforehand what that is. The answer is what still has to go.
+         */
+        put: operations["store_retention"];
         post?: never;
-        delete?: never;
+        /** Lets each server's own flags hold again. */
+        delete: operations["forget_retention"];
         options?: never;
         head?: never;
         patch?: never;
@@ -1314,11 +1339,8 @@ export interface components {
              * @description Steepest slope, degrees.
              */
             steepest_slope_deg: number;
-            /**
-             * Format: int64
-             * @description Grows with every change of state or comment; 0: nobody has said anything.
-             */
-            version: number;
+            /** @description Another after every change of state or comment; a PATCH that brings it as `If-Match` changes nothing else. */
+            version: string;
             /**
              * Format: double
              * @description Volume, mm³.
@@ -1350,17 +1372,12 @@ export interface components {
             /** @description Words for people, at most 4,000 characters. */
             comment?: string | null;
             state?: components["schemas"]["DefectState"] | null;
-            /**
-             * Format: int64
-             * @description The version that the writer has seen: where somebody else has changed the defect since, nothing is changed (409).
-             */
-            version?: number | null;
         };
         /** @description One defect over the runs that passed its place. */
         DefectHistory: {
             /** @description The defect that was asked for. */
             defect: components["schemas"]["Defect"];
-            /** @description The runs of its asset and direction that passed its place, the one recorded last first. */
+            /** @description The runs of its asset that passed its place, either way, the one recorded last first. */
             items: components["schemas"]["DefectSighting"][];
         };
         /** @description A page of defects. */
@@ -1773,6 +1790,8 @@ export interface components {
              * @description While more than this is stored the oldest runs go, GB; absent where size does not matter.
              */
             quota_gb?: number | null;
+            /** @description The rules that hold now, whatever was asked about. */
+            rules: components["schemas"]["RetentionRules"];
             /**
              * Format: int64
              * @description Number of runs that would go.
@@ -1783,6 +1802,50 @@ export interface components {
              * @description Bytes of all sources and products now.
              */
             stored_bytes: number;
+        };
+        /** @description The rules of keeping that hold now. */
+        RetentionRules: {
+            /** @description When people last stored rules, or let the servers' own hold again (RFC 3339). */
+            changed_at?: string | null;
+            /** @description Who did: the name of a token or a session. */
+            changed_by?: string | null;
+            /**
+             * Format: double
+             * @description Runs older than this go, days; absent where age does not matter.
+             */
+            keep_days?: number | null;
+            /** @description Where they come from. */
+            origin: components["schemas"]["RulesOrigin"];
+            /**
+             * Format: double
+             * @description What `--keep-days` of the answering server says, days.
+             */
+            own_keep_days?: number | null;
+            /**
+             * Format: double
+             * @description What `--quota-gb` of the answering server says, GB.
+             */
+            own_quota_gb?: number | null;
+            /**
+             * Format: double
+             * @description While more than this is stored the oldest runs go, GB; absent where size does not matter.
+             */
+            quota_gb?: number | null;
+            /** @description Another after every change; a PUT or DELETE that brings it as `If-Match` changes nothing else. */
+            version: string;
+        };
+        /** @description Rules of keeping to be stored; what is absent or null does not matter. */
+        RetentionWish: {
+            /**
+             * Format: double
+             * @description Runs that came in more than so many days ago shall go.
+             */
+            keep_days?: number | null;
+            /**
+             * Format: double
+             * @description While more than so many GB are stored, the oldest runs shall go.
+             */
+            quota_gb?: number | null;
         };
         /** @description A stored rig. */
         Rig: {
@@ -1812,6 +1875,11 @@ export interface components {
              */
             overlap_s?: number | null;
         };
+        /**
+         * @description Where the rules that hold come from.
+         * @enum {string}
+         */
+        RulesOrigin: "server" | "stored";
         /** @description One pass of a robot along an asset. */
         Run: {
             /** @description The pipe or wall. */
@@ -3022,7 +3090,10 @@ export interface operations {
     change_defect: {
         parameters: {
             query?: never;
-            header?: never;
+            header?: {
+                /** @description The defect's `version`, quoted: changes nothing where it has another by now */
+                "If-Match"?: string | null;
+            };
             path: {
                 /** @description The defect */
                 defect: string;
@@ -3086,8 +3157,8 @@ export interface operations {
                     "application/problem+json": components["schemas"]["Problem"];
                 };
             };
-            /** @description Somebody else has changed it since that version */
-            409: {
+            /** @description Somebody else has changed it */
+            412: {
                 headers: {
                     [name: string]: unknown;
                 };
@@ -3547,6 +3618,90 @@ export interface operations {
                 };
                 content: {
                     "application/json": components["schemas"]["ChangeReport"];
+                };
+            };
+            /** @description It is being worked out; `Retry-After` says when to come back */
+            202: {
+                headers: {
+                    [name: string]: unknown;
+                };
+                content?: never;
+            };
+            400: {
+                headers: {
+                    [name: string]: unknown;
+                };
+                content: {
+                    "application/problem+json": components["schemas"]["Problem"];
+                };
+            };
+            /** @description Nobody that this server knows */
+            401: {
+                headers: {
+                    [name: string]: unknown;
+                };
+                content: {
+                    "application/problem+json": components["schemas"]["Problem"];
+                };
+            };
+            /** @description The token may not do this, or the request comes from a foreign page */
+            403: {
+                headers: {
+                    [name: string]: unknown;
+                };
+                content: {
+                    "application/problem+json": components["schemas"]["Problem"];
+                };
+            };
+            404: {
+                headers: {
+                    [name: string]: unknown;
+                };
+                content: {
+                    "application/problem+json": components["schemas"]["Problem"];
+                };
+            };
+            /** @description Too many requests; `Retry-After` says when to come back */
+            429: {
+                headers: {
+                    [name: string]: unknown;
+                };
+                content: {
+                    "application/problem+json": components["schemas"]["Problem"];
+                };
+            };
+            /** @description The records or files do not answer, or all places are taken; come back in a moment */
+            503: {
+                headers: {
+                    [name: string]: unknown;
+                };
+                content: {
+                    "application/problem+json": components["schemas"]["Problem"];
+                };
+            };
+        };
+    };
+    get_difference: {
+        parameters: {
+            query: {
+                /** @description The earlier job, of the same asset. */
+                before: string;
+            };
+            header?: never;
+            path: {
+                /** @description The later job */
+                job: string;
+            };
+            cookie?: never;
+        };
+        requestBody?: never;
+        responses: {
+            200: {
+                headers: {
+                    [name: string]: unknown;
+                };
+                content: {
+                    "image/tiff": number[];
                 };
             };
             /** @description It is being worked out; `Retry-After` says when to come back */
@@ -5002,10 +5157,12 @@ export interface operations {
     preview_retention: {
         parameters: {
             query?: {
-                /** @description As if runs older than this went, days; the server's own value when nothing is said. */
+                /** @description As if runs older than this went, days; as the rules that hold say where nothing is said. */
                 keep_days?: number;
-                /** @description As if the oldest runs went while more than this is stored, GB; the server's own value when nothing is said. */
+                /** @description As if the oldest runs went while more than this is stored, GB; as the rules that hold say where nothing is said. */
                 quota_gb?: number;
+                /** @description As if there were no other rules than those that the query names. */
+                exactly?: boolean;
             };
             header?: never;
             path?: never;
@@ -5040,6 +5197,188 @@ export interface operations {
             };
             /** @description The token may not do this, or the request comes from a foreign page */
             403: {
+                headers: {
+                    [name: string]: unknown;
+                };
+                content: {
+                    "application/problem+json": components["schemas"]["Problem"];
+                };
+            };
+            /** @description Too many requests; `Retry-After` says when to come back */
+            429: {
+                headers: {
+                    [name: string]: unknown;
+                };
+                content: {
+                    "application/problem+json": components["schemas"]["Problem"];
+                };
+            };
+            /** @description The records or files do not answer, or all places are taken; come back in a moment */
+            503: {
+                headers: {
+                    [name: string]: unknown;
+                };
+                content: {
+                    "application/problem+json": components["schemas"]["Problem"];
+                };
+            };
+        };
+    };
+    store_retention: {
+        parameters: {
+            query?: never;
+            header?: {
+                /** @description The rules' `version`, quoted: stores nothing where they have another by now */
+                "If-Match"?: string | null;
+            };
+            path?: never;
+            cookie?: never;
+        };
+        requestBody: {
+            content: {
+                "application/json": components["schemas"]["RetentionWish"];
+            };
+        };
+        responses: {
+            200: {
+                headers: {
+                    [name: string]: unknown;
+                };
+                content: {
+                    "application/json": components["schemas"]["RetentionPreview"];
+                };
+            };
+            400: {
+                headers: {
+                    [name: string]: unknown;
+                };
+                content: {
+                    "application/problem+json": components["schemas"]["Problem"];
+                };
+            };
+            /** @description Nobody that this server knows */
+            401: {
+                headers: {
+                    [name: string]: unknown;
+                };
+                content: {
+                    "application/problem+json": components["schemas"]["Problem"];
+                };
+            };
+            /** @description The token may not do this, or the request comes from a foreign page */
+            403: {
+                headers: {
+                    [name: string]: unknown;
+                };
+                content: {
+                    "application/problem+json": components["schemas"]["Problem"];
+                };
+            };
+            /** @description The sender was silent for too long */
+            408: {
+                headers: {
+                    [name: string]: unknown;
+                };
+                content: {
+                    "application/problem+json": components["schemas"]["Problem"];
+                };
+            };
+            /** @description Somebody else has changed them */
+            412: {
+                headers: {
+                    [name: string]: unknown;
+                };
+                content: {
+                    "application/problem+json": components["schemas"]["Problem"];
+                };
+            };
+            /** @description More bytes than this server takes */
+            413: {
+                headers: {
+                    [name: string]: unknown;
+                };
+                content: {
+                    "application/problem+json": components["schemas"]["Problem"];
+                };
+            };
+            /** @description The body's type does not fit */
+            415: {
+                headers: {
+                    [name: string]: unknown;
+                };
+                content: {
+                    "application/problem+json": components["schemas"]["Problem"];
+                };
+            };
+            /** @description Too many requests; `Retry-After` says when to come back */
+            429: {
+                headers: {
+                    [name: string]: unknown;
+                };
+                content: {
+                    "application/problem+json": components["schemas"]["Problem"];
+                };
+            };
+            /** @description The records or files do not answer, or all places are taken; come back in a moment */
+            503: {
+                headers: {
+                    [name: string]: unknown;
+                };
+                content: {
+                    "application/problem+json": components["schemas"]["Problem"];
+                };
+            };
+        };
+    };
+    forget_retention: {
+        parameters: {
+            query?: never;
+            header?: {
+                /** @description The rules' `version`, quoted: changes nothing where they have another by now */
+                "If-Match"?: string | null;
+            };
+            path?: never;
+            cookie?: never;
+        };
+        requestBody?: never;
+        responses: {
+            200: {
+                headers: {
+                    [name: string]: unknown;
+                };
+                content: {
+                    "application/json": components["schemas"]["RetentionPreview"];
+                };
+            };
+            /** @description The request cannot be used; `field` and `expected` say why */
+            400: {
+                headers: {
+                    [name: string]: unknown;
+                };
+                content: {
+                    "application/problem+json": components["schemas"]["Problem"];
+                };
+            };
+            /** @description Nobody that this server knows */
+            401: {
+                headers: {
+                    [name: string]: unknown;
+                };
+                content: {
+                    "application/problem+json": components["schemas"]["Problem"];
+                };
+            };
+            /** @description The token may not do this, or the request comes from a foreign page */
+            403: {
+                headers: {
+                    [name: string]: unknown;
+                };
+                content: {
+                    "application/problem+json": components["schemas"]["Problem"];
+                };
+            };
+            /** @description Somebody else has changed them */
+            412: {
                 headers: {
                     [name: string]: unknown;
                 };

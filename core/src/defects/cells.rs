@@ -1,10 +1,22 @@
 //! The map in larger cells, a stretch at a time.
 
-use crate::depth_map::{MapGeometry, MapReader};
+use std::ops::Range;
+
+use crate::depth_map::{MapGeometry, MapReader, rectangles, written};
 use crate::error::Result;
 
-/// Columns of the map that are read at once, px.
-const READ_PX: usize = 512;
+/// Columns and rows of the map that are read at once, px.
+const READ_PX: usize = 256;
+const READ_ROWS_PX: usize = 1024;
+/// Rows of cells, at most: a map so high has parts that lie far from each other, and is searched in larger cells.
+const MOST_ROWS: usize = 2048;
+/// Cells that are examined at once, about (a dozen values of each are at hand), and the fewest columns of them that a
+/// stretch answers for.
+const CELLS_AT_ONCE: usize = 1_200_000;
+const FEWEST_CORE_COLUMNS: usize = 512;
+/// Columns of cells that a stretch answers for at most, and that it reads on each side besides.
+const CORE_COLUMNS: usize = 2048;
+const MARGIN_COLUMNS: usize = 384;
 /// Share of a cell's pixels that must be measured.
 const LEAST_SHARE: f32 = 0.4;
 /// Distance of the wall that gives a cell of 1 mm, mm: at it, two image rows are half a millimetre or so apart.
@@ -31,7 +43,7 @@ impl CellGrid {
     /// Cells for a map of a wall at a distance; `cell_mm` above 0 asks for a size.
     pub(super) fn new(map: &MapGeometry, distance_mm: f64, cell_mm: f64) -> CellGrid {
         let wanted_mm = if cell_mm > 0.0 { cell_mm } else { distance_mm / DISTANCE_PER_CELL };
-        let factor = ((wanted_mm / map.mm_per_px).round() as usize).max(1);
+        let factor = ((wanted_mm / map.mm_per_px).round() as usize).max(map.height_px.div_ceil(MOST_ROWS)).max(1);
         let shift_mm = (factor - 1) as f64 / 2.0 * map.mm_per_px;
         CellGrid {
             x0_mm: map.x0_mm + shift_mm,
@@ -55,6 +67,17 @@ impl CellGrid {
         }
     }
 
+    /// The stretches that are examined one after the other: the columns that each answers for, and those that it reads.
+    pub(super) fn stretches(&self) -> impl Iterator<Item = (Range<usize>, Range<usize>)> {
+        let room = (CELLS_AT_ONCE / self.rows.max(1)).saturating_sub(2 * MARGIN_COLUMNS);
+        let (columns, step) = (self.columns, room.clamp(FEWEST_CORE_COLUMNS, CORE_COLUMNS));
+        (0..columns).step_by(step).map(move |start| {
+            let core = start..(start + step).min(columns);
+            let read = start.saturating_sub(MARGIN_COLUMNS)..(core.end + MARGIN_COLUMNS).min(columns);
+            (core, read)
+        })
+    }
+
     /// World x of a column's centre, mm.
     pub(super) fn x_mm(&self, column: f64) -> f64 {
         self.x0_mm + column * self.cell_mm
@@ -69,13 +92,13 @@ impl CellGrid {
     pub(super) fn read(&self, map: &mut dyn MapReader, first: usize, columns: usize) -> Result<Field> {
         let k = self.factor;
         let mut sums = Field::new(columns, self.rows, 0.0);
-        let mut counts = vec![0_u16; columns * self.rows];
-        let at_once = (READ_PX / k).max(1);
-        for from in (0..columns).step_by(at_once) {
-            let some = at_once.min(columns - from);
-            let window = map.window((first + from) * k, 0, some * k, self.rows * k)?;
-            for (row, line) in window.depth_mm.chunks_exact(some * k).enumerate() {
-                let start = row / k * columns + from;
+        let mut counts = written(0_u16, columns * self.rows);
+        // Whole cells at once.
+        let at_once = [READ_PX, READ_ROWS_PX].map(|px| (px / k).max(1) * k);
+        for [left, top, width, height] in rectangles([columns * k, self.rows * k], at_once) {
+            let window = map.window(first * k + left, top, width, height)?;
+            for (row, line) in (top..).zip(window.depth_mm.chunks_exact(width)) {
+                let start = row / k * columns + left / k;
                 for (column, pixels) in line.chunks_exact(k).enumerate() {
                     for z_mm in pixels.iter().filter(|z| z.is_finite()) {
                         sums.values[start + column] += z_mm;
@@ -102,7 +125,7 @@ pub(super) struct Field {
 
 impl Field {
     pub(super) fn new(columns: usize, rows: usize, value: f32) -> Field {
-        Field { columns, rows, values: vec![value; columns * rows] }
+        Field { columns, rows, values: written(value, columns * rows) }
     }
 
     /// The mean of what is finite in squares of `factor` cells; NaN where less than a share `least` is.
@@ -128,13 +151,22 @@ impl Field {
 
     /// Smoothed by a Gaussian of `sigma` cells over what is finite; NaN where that is less than `least` of the weight.
     pub(super) fn smoothed(&self, sigma: f32, least: f32) -> Field {
-        let kernel = gaussian(sigma);
-        let known: Vec<f32> = self.values.iter().map(|v| if v.is_finite() { 1.0 } else { 0.0 }).collect();
-        let filled: Vec<f32> = self.values.iter().map(|v| if v.is_finite() { *v } else { 0.0 }).collect();
-        let sums = convolved(&filled, self.columns, self.rows, &kernel);
-        let weights = convolved(&known, self.columns, self.rows, &kernel);
-        let values = sums.iter().zip(&weights).map(|(s, w)| if *w >= least { s / w } else { f32::NAN }).collect();
+        let filled = self.values.iter().map(|v| if v.is_finite() { *v } else { 0.0 }).collect();
+        let mut values = self.convolved(filled, sigma);
+        for (value, weight) in values.iter_mut().zip(self.known_weight(sigma)) {
+            *value = if weight >= least { *value / weight } else { f32::NAN };
+        }
         Field { columns: self.columns, rows: self.rows, values }
+    }
+
+    /// The share of the smoothing's weight that is finite, about each cell: where it is less than the least share,
+    /// [`Field::smoothed`] has NaN.
+    pub(super) fn known_weight(&self, sigma: f32) -> Vec<f32> {
+        self.convolved(self.values.iter().map(|v| if v.is_finite() { 1.0 } else { 0.0 }).collect(), sigma)
+    }
+
+    fn convolved(&self, values: Vec<f32>, sigma: f32) -> Vec<f32> {
+        convolved(values, self.columns, self.rows, &gaussian(sigma))
     }
 
     /// The median of the finite values' distances from 0, as a standard deviation; `None` where there are too few.
@@ -155,8 +187,8 @@ fn gaussian(sigma: f32) -> Vec<f32> {
 }
 
 /// Along the rows, then along the columns; beyond the edges lies nothing.
-fn convolved(values: &[f32], columns: usize, rows: usize, kernel: &[f32]) -> Vec<f32> {
-    let mut along = vec![0.0_f32; values.len()];
+fn convolved(mut values: Vec<f32>, columns: usize, rows: usize, kernel: &[f32]) -> Vec<f32> {
+    let mut along = written(0.0_f32, values.len());
     for (line, out) in values.chunks_exact(columns).zip(along.chunks_exact_mut(columns)) {
         out.iter_mut().zip(line).for_each(|(o, v)| *o = kernel[0] * v);
         for (shift, weight) in kernel.iter().enumerate().skip(1).take_while(|(shift, _)| *shift < columns) {
@@ -164,8 +196,7 @@ fn convolved(values: &[f32], columns: usize, rows: usize, kernel: &[f32]) -> Vec
             out.iter_mut().zip(&line[shift..]).for_each(|(o, v)| *o += weight * v);
         }
     }
-    let mut both = vec![0.0_f32; values.len()];
-    for (row, out) in both.chunks_exact_mut(columns).enumerate() {
+    for (row, out) in values.chunks_exact_mut(columns).enumerate() {
         let line = |row: usize| &along[row * columns..(row + 1) * columns];
         out.iter_mut().zip(line(row)).for_each(|(o, v)| *o = kernel[0] * v);
         for (shift, weight) in kernel.iter().enumerate().skip(1) {
@@ -177,7 +208,7 @@ fn convolved(values: &[f32], columns: usize, rows: usize, kernel: &[f32]) -> Vec
             }
         }
     }
-    both
+    values
 }
 
 #[cfg(test)]

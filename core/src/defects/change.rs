@@ -16,16 +16,14 @@ use super::reference::Reference;
 use super::regions;
 use super::register::{Registration, register};
 use super::stretch::{self, COARSE, FIRST_LENGTH};
-use super::{CellGrid, Defect, DefectList, MARGIN_COLUMNS, ResidualStrip, SMOOTHING_CELLS, Sampling};
+use super::{CellGrid, Defect, DefectList, ResidualStrip, SMOOTHING_CELLS, Sampling, turned};
 use crate::depth_map::MapReader;
-use crate::error::{Error, Result};
+use crate::error::Result;
 use crate::recipe::DefectOptions;
 
 /// Version of the shape of `change.json`.
 pub const SCHEMA_VERSION: u32 = 1;
 
-/// Columns of cells that are compared at once.
-const CORE_COLUMNS: usize = 2048;
 /// Smoothing of the difference before the search, cells: what two runs do not share is mostly fine.
 const CHANGE_SMOOTHING_CELLS: f32 = 1.8;
 /// Standard deviations of the level of detection: 95 % of what does not change stays below.
@@ -145,10 +143,10 @@ pub struct ChangeList {
     pub unsure_after: Vec<u32>,
 }
 
-/// Compares two runs; `take` gets the difference map (later less earlier, in the earlier run's cells) strip by strip.
+/// Compares two runs, also such as went opposite ways; `take` gets the difference map (later less earlier, in the earlier run's cells) strip by strip.
 ///
 /// # Errors
-/// Runs in opposite directions, or whose relief does not agree anywhere; what reading the maps or `take` says.
+/// Runs whose relief does not agree anywhere; what reading the maps or `take` says.
 pub fn compare(
     before: &mut Run,
     after: &mut Run,
@@ -156,11 +154,9 @@ pub fn compare(
     take: &mut dyn FnMut(&ResidualStrip) -> Result<()>,
 ) -> Result<ChangeList> {
     if before.list.chainage_falls != after.list.chainage_falls {
-        return Err(Error::input(
-            "the later run",
-            "a run in the opposite direction",
-            "two runs in the same direction along the asset",
-        ));
+        let list = turned::turned(after.list);
+        let mut residual = turned::TurnedMap { map: after.residual };
+        return compare(before, &mut Run { residual: &mut residual, list: &list }, options, take);
     }
     let shift_mm = match before.list.chainage_falls {
         false => before.list.start_chainage_mm - after.list.start_chainage_mm,
@@ -176,10 +172,9 @@ pub fn compare(
     let sampling = Sampling {
         profile_step_mm: before.list.profile_step_mm.max(after.list.profile_step_mm),
         line_step_mm: before.list.line_step_mm.max(after.list.line_step_mm),
+        line_width_mm: before.list.line_width_mm.max(after.list.line_width_mm),
     };
-    for start in (0..grid.columns).step_by(CORE_COLUMNS) {
-        let core = start..(start + CORE_COLUMNS).min(grid.columns);
-        let columns = start.saturating_sub(MARGIN_COLUMNS)..(core.end + MARGIN_COLUMNS).min(grid.columns);
+    for (core, columns) in grid.stretches() {
         let earlier = grid.read(before.residual, columns.start, columns.len())?;
         let later = registration.read(&grid, &columns, &other, after.residual)?;
         let stretch =

@@ -86,6 +86,7 @@ impl Gathered {
             cell_mm: grid.cell_mm,
             profile_step_mm: sampling.profile_step_mm,
             line_step_mm: sampling.line_step_mm,
+            line_width_mm: sampling.line_width_mm,
             reference: self.reference(shape, radius_sd_mm, wave_mm),
             inspected: Inspected {
                 x_min_mm: grid.x_mm(-0.5),

@@ -26,6 +26,9 @@ const ASTRAY: f64 = 0.7;
 const TAKEN_OFF_EXPLAINED: f64 = 0.9;
 const TAKEN_OFF_MEASURED: f64 = 0.15;
 const LARGER: f64 = 1.6;
+/// One that explains this share may be so many times smaller than the region.
+const CLEARLY_EXPLAINED: f64 = 0.75;
+const SMALLER: f64 = 2.4;
 const HIGHER: (f64, f64) = (0.5, 1.7);
 /// Cells within another's footprint show a part of a dent's height only: its form may be so many times as high.
 const HIGHER_IN_ANOTHER: f64 = 2.2;
@@ -192,11 +195,13 @@ fn believed(start: &Form, fit: &Fit, blur: Blur, in_another: bool) -> bool {
     let radius = |form: &Form| (form.area_cells() / std::f64::consts::PI).sqrt();
     let (was, is) = (radius(start), radius(form));
     let higher = form.height_mm / start.height_mm;
+    // Counted cell by cell, a low one may have a wave beside it for a part of itself: a form that leaves it out is smaller.
+    let smaller = if fit.explained >= CLEARLY_EXPLAINED { SMALLER } else { LARGER };
     fit.explained >= LEAST_EXPLAINED
         && fit.measured_share >= LEAST_MEASURED
         && away <= ASTRAY * was
         && is <= LARGER * was
-        && was <= LARGER * is
+        && was <= smaller * is
         && higher >= HIGHER.0
         && higher <= if in_another { HIGHER_IN_ANOTHER } else { HIGHER.1 }
         && (in_another || form.summit_mm(blur) / start.height_mm <= ABOVE_CELLS)
@@ -232,17 +237,21 @@ fn within_others(
             stretch.slack(cell) + UNLIKE * form_mm / stretch.thresholds_mm[cell / columns]
         })
         .collect();
-    let mut even = smooth.clone();
-    even.values.iter_mut().zip(&slack).for_each(|(v, s)| *v /= s);
     // It must be a place of its own, not a rim that is no raised cosine's.
     let least = HIDDEN_CELLS * least_cells(options, stretch.grid.cell_mm);
+    let mut even = smooth.clone();
+    even.values.iter_mut().zip(&slack).for_each(|(v, s)| *v /= s);
     let mut regions = regions::find(&even, stretch.thresholds_mm);
+    drop(even);
     // One beside all others was looked at before: it was not believed, or lies in the scatter of its own row.
     let covered = |region: &Region| {
         let summit = region.summit;
         (stretch.deviation.values[summit] - rest.values[summit]).abs() > 0.0
     };
     regions.retain(|region| region.cells.len() > least && covered(region));
+    if regions.is_empty() {
+        return Vec::new();
+    }
     let mut taken = vec![false; smooth.values.len()];
     regions.iter().flat_map(|region| &region.cells).for_each(|cell| taken[*cell] = true);
     let near_gap = near_gaps(rest, APART_CELLS);

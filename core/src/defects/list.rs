@@ -235,6 +235,9 @@ pub struct DefectList {
     /// Distance of two line positions (image rows) on the surface, mm; 0 where it is not known.
     #[serde(default)]
     pub line_step_mm: f64,
+    /// Width of the laser's line on the surface, mm at half of its height; 0 where it is not known.
+    #[serde(default)]
+    pub line_width_mm: f64,
     /// The undamaged shape.
     pub reference: ReferenceShape,
     /// What was looked at.

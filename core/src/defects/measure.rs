@@ -25,6 +25,10 @@ const LEAST_FLAT_CELLS: usize = 30;
 /// of it must reach the threshold there, in least radii.
 const LEAST_SUPPORT: f64 = 0.5;
 const LEAST_DISC: f64 = 1.5;
+/// What lies across more than this share of the map's height at once may be a wrong pose of the camera: it must reach this
+/// many thresholds.
+const WHOLE_SECTION: f64 = 0.6;
+const WHOLE_SECTION_FACTOR: f32 = 2.0;
 /// The rim in extents at half height, a little beyond; how much wider the ring about it is, and by how many cells.
 const RIM: f64 = 1.15;
 const RING: f64 = 1.3;
@@ -215,7 +219,7 @@ pub(super) fn measure(stretch: &Stretch, region: &Region, options: &DefectOption
     })
 }
 
-/// Whether the region is more than what a gap does to its neighbours, or a single profile.
+/// Whether the region is more than what a gap does to its neighbours, a single profile, or a wrong pose.
 fn believed(relief: &Relief, options: &DefectOptions) -> bool {
     let stretch = relief.stretch;
     let rough = relief.height(relief.region.summit);
@@ -228,7 +232,10 @@ fn believed(relief: &Relief, options: &DefectOptions) -> bool {
     let disc_cells = std::f64::consts::PI * (LEAST_DISC * options.radius_min_mm / cell_mm).powi(2);
     let supported = firm.len() as f64 >= LEAST_SUPPORT * upper.len() as f64 || alone >= disc_cells;
     let length = extents(upper.iter().copied(), relief.columns).map_or(0.0, |across| across.0 as f64 * cell_mm);
-    supported && length > least_radius_mm(stretch.profile_step_mm)
+    let rows = extents(relief.region.cells.iter().copied(), relief.columns).map_or(0, |across| across.1);
+    let whole_section = rows as f64 > WHOLE_SECTION * stretch.smooth.rows as f64;
+    let clear = !whole_section || rough > WHOLE_SECTION_FACTOR * threshold;
+    supported && clear && length > least_radius_mm(stretch.profile_step_mm)
 }
 
 /// The plane of what lies about a region and belongs to none: its value at the summit and its slopes.

@@ -30,7 +30,7 @@ fn map(width_px: usize, base: impl Fn(f64, f64) -> f64, bumps: &[Bump], hole: im
 }
 
 /// The maps of these tests are not blurred.
-const SAMPLING: Sampling = Sampling { profile_step_mm: 0.1, line_step_mm: 0.0 };
+const SAMPLING: Sampling = Sampling { profile_step_mm: 0.1, line_step_mm: 0.0, line_width_mm: 0.0 };
 
 fn found(map: &mut GridMap) -> Findings {
     let recipe = Recipe::default();

@@ -17,9 +17,6 @@ const EDGE_MM: f64 = 1.0;
 /// Frames that a row may be without a spot and still be joined to the one before.
 const MAX_FRAME_GAP: u32 = 3;
 
-/// Grid rows between the highest and the lowest place of a surface, at most.
-const MAX_ROWS: i64 = 65_536;
-
 /// The surface's colours between a frame's profile and the one before it.
 #[derive(Clone, Debug, PartialEq)]
 pub struct WallColours {
@@ -102,9 +99,13 @@ impl Sheet {
 
     /// Fills the cells between a row's last sample and this one.
     fn put(&mut self, map: &mut SurfaceMap, row: i64, sample: Sample, colours: Option<&WallColours>) -> Result<()> {
-        let Some(slot) = self.slot(row) else { return Ok(()) };
-        let last = slot.replace(sample);
-        let column = |x_mm: f64| (x_mm - self.grid.x_mm) / self.grid.mm_per_px;
+        let grid = self.grid;
+        let column = |x_mm: f64| (x_mm - grid.x_mm) / grid.mm_per_px;
+        let nearest = column(sample.x_mm).round() as i64;
+        if !map.makes_room([nearest, nearest], row) {
+            return Ok(());
+        }
+        let last = self.slot(row).replace(sample);
         let joined = last.filter(|last| {
             last.part == sample.part
                 && last.frame < sample.frame
@@ -118,7 +119,7 @@ impl Sheet {
                 weight: sample.weight as f32,
                 rgb: colours.and_then(|c| c.at(sample.line_position, 1.0)),
             };
-            return map.blend_run(column(sample.x_mm).round() as i64, row, &[cell]);
+            return map.blend_run(nearest, row, &[cell]);
         };
         let (from, to) = (column(last.x_mm), column(sample.x_mm));
         // Centres on the far end belong to this pair, those on the near end to the one before.
@@ -143,13 +144,10 @@ impl Sheet {
         map.blend_run(low, row, &self.cells)
     }
 
-    /// `None` for a row too far from the others: no wall is so high, a pose was wrong.
-    fn slot(&mut self, row: i64) -> Option<&mut Option<Sample>> {
+    /// The last sample of a row. The map had room for it: there are no more rows than its limits allow.
+    fn slot(&mut self, row: i64) -> &mut Option<Sample> {
         if self.rows.is_empty() {
             self.first_row = row;
-        }
-        if (row - self.first_row).abs() > MAX_ROWS {
-            return None;
         }
         if row < self.first_row {
             let missing = (self.first_row - row) as usize;
@@ -160,7 +158,7 @@ impl Sheet {
         if at >= self.rows.len() {
             self.rows.resize(at + 1, None);
         }
-        self.rows.get_mut(at)
+        &mut self.rows[at]
     }
 }
 

@@ -7,8 +7,10 @@
 //! | `/camera/calibration` | foxglove.CameraCalibration | once, at the start |
 //! | `/camera/raw` | foxglove.RawImage | the same for sources of pixels that are not packed |
 //! | `/tf` | foxglove.FrameTransforms | `camera` in `world`, where it is known |
+//! | `/tf_static` | foxglove.FrameTransforms | `world` upright in the root of rerun's space, once |
 //! | `/profile` | foxglove.PointCloud | each frame's profile, in `camera` |
 //! | `/surface` | foxglove.PointCloud | the surface in `world`, in chunks of some frames |
+//! | `/surface/overview` | foxglove.PointCloud | all of it, thinned to one message, at the end |
 //! | `/measurement` | JSON | dx, dy, scale, residual, rows found, where on the wall |
 //! | `/log` | foxglove.Log | warnings |
 //! | `/defects` | foxglove.SceneUpdate | a box around each defect, where defects were looked for |
@@ -28,10 +30,12 @@
 
 mod cut;
 mod grid;
+mod overview;
 mod points;
 mod scene;
 
 use std::collections::{BTreeMap, HashMap};
+use std::f64::consts::FRAC_PI_2;
 use std::path::{Path, PathBuf};
 
 use foxglove::messages::{
@@ -41,6 +45,7 @@ use foxglove::messages::{
 use foxglove::{Encode, Schema};
 use mcap::records::MessageHeader;
 use mcap::{Attachment, Compression, McapError, WriteOptions, Writer};
+use nalgebra::{Isometry3, Translation3, UnitQuaternion};
 use serde::Serialize;
 
 use crate::depth_map::{MapGeometry, MapWindow};
@@ -55,6 +60,7 @@ use crate::stripe::Stripe;
 use crate::surface::SurfacePoint;
 use crate::triangulation::Profile;
 
+use overview::SurfaceOverview;
 use points::cloud;
 
 pub use cut::{ArchiveCut, ArchiveSource, cut};
@@ -74,6 +80,7 @@ mod topic {
     pub(super) const TRANSFORMS: &str = "/tf";
     pub(super) const PROFILE: &str = "/profile";
     pub(super) const SURFACE: &str = "/surface";
+    pub(super) const SURFACE_OVERVIEW: &str = "/surface/overview";
     pub(super) const MEASUREMENT: &str = "/measurement";
     pub(super) const DEPTH_MAP: &str = "/depth_map";
 }
@@ -82,6 +89,9 @@ mod topic {
 const CAMERA: &str = "camera";
 /// Frame of reference of the surface and the map.
 const WORLD: &str = "world";
+/// What rerun calls the frame of its space's root: a recording that it makes of an archive shows in 3D what is tied to it.
+/// There, as in Foxglove's space, z points up.
+const RERUN_ROOT: &str = "tf#/";
 
 /// What `/measurement` holds of a frame; a value that is not known is absent.
 #[derive(Serialize)]
@@ -133,6 +143,7 @@ pub struct ArchiveWriter {
     start_ns: u64,
     latest_s: f64,
     chunk: Chunk,
+    overview: SurfaceOverview,
     buffer: Vec<u8>,
 }
 
@@ -170,6 +181,7 @@ impl ArchiveWriter {
             start_ns: u64::try_from(recorded_at.as_nanosecond()).unwrap_or(0),
             latest_s: 0.0,
             chunk: Chunk::default(),
+            overview: SurfaceOverview::new(),
             buffer: Vec::new(),
         };
         archive.metadata("stria", &[("version", env!("CARGO_PKG_VERSION")), ("archive_version", ARCHIVE_VERSION)])?;
@@ -188,6 +200,9 @@ impl ArchiveWriter {
         archive.attach("rig.toml", "application/toml", rig.to_toml().as_bytes())?;
         archive.attach("recipe.toml", "application/toml", recipe.to_toml().as_bytes())?;
         archive.calibration(rig)?;
+        let upright = UnitQuaternion::from_axis_angle(&nalgebra::Vector3::x_axis(), -FRAC_PI_2);
+        let root = archive.transform(0.0, RERUN_ROOT, WORLD, &Isometry3::from_parts(Translation3::identity(), upright));
+        archive.write("/tf_static", 0.0, &root)?;
         Ok(archive)
     }
 
@@ -236,16 +251,22 @@ impl ArchiveWriter {
     /// # Errors
     /// As [`ArchiveWriter::video`].
     pub fn pose(&mut self, time_s: f64, world_from_camera: &WorldFromCamera) -> Result<()> {
-        let t = world_from_camera.translation.vector / 1000.0;
-        let q = world_from_camera.rotation.coords;
+        let transform = self.transform(time_s, WORLD, CAMERA, world_from_camera);
+        self.write(topic::TRANSFORMS, time_s, &transform)
+    }
+
+    /// Where a frame of reference lies in another.
+    fn transform(&self, time_s: f64, parent: &str, child: &str, pose: &Isometry3<f64>) -> FrameTransforms {
+        let t = pose.translation.vector / 1000.0;
+        let q = pose.rotation.coords;
         let transform = FrameTransform {
             timestamp: Some(self.timestamp(time_s)),
-            parent_frame_id: WORLD.into(),
-            child_frame_id: CAMERA.into(),
+            parent_frame_id: parent.into(),
+            child_frame_id: child.into(),
             translation: Some(Vector3 { x: t.x, y: t.y, z: t.z }),
             rotation: Some(Quaternion { x: q.x, y: q.y, z: q.z, w: q.w }),
         };
-        self.write(topic::TRANSFORMS, time_s, &FrameTransforms { transforms: vec![transform] })
+        FrameTransforms { transforms: vec![transform] }
     }
 
     /// Adds a frame's profile, in the camera's frame.
@@ -267,6 +288,7 @@ impl ArchiveWriter {
             self.chunk.first_s = time_s;
         }
         self.chunk.points.extend_from_slice(points);
+        self.overview.add(points);
         self.chunk.last_s = time_s;
         self.latest_s = self.latest_s.max(time_s);
         let full = self.chunk.points.len() >= CHUNK_POINTS || time_s - self.chunk.first_s >= CHUNK_S;
@@ -406,6 +428,11 @@ impl ArchiveWriter {
     /// As [`ArchiveWriter::video`].
     pub fn finish(mut self) -> Result<()> {
         self.write_chunk()?;
+        if !self.overview.points().is_empty() {
+            let of = self.overview.points().iter().map(|p| (p.point_in_world, p.rgb, p.confidence));
+            let overview = cloud(self.timestamp(self.latest_s), WORLD, of);
+            self.write(topic::SURFACE_OVERVIEW, self.latest_s, &overview)?;
+        }
         self.writer.finish().map_err(|e| failed(&self.path, e))?;
         self.writer.into_inner().commit()
     }

@@ -50,6 +50,13 @@ impl Canvas {
         self.pixels.as_flattened()
     }
 
+    /// Sets a pixel; outside the picture nothing happens.
+    pub(crate) fn put(&mut self, x: i64, y: i64, colour: Rgb) {
+        if (0..self.width_px as i64).contains(&x) && (0..self.height_px as i64).contains(&y) {
+            self.pixels[y as usize * self.width_px + x as usize] = colour;
+        }
+    }
+
     /// Mixes a colour in; outside the picture nothing happens.
     pub(crate) fn blend(&mut self, x: i64, y: i64, colour: Rgb, alpha: f32) {
         let inside = (0..self.width_px as i64).contains(&x) && (0..self.height_px as i64).contains(&y);

@@ -10,11 +10,14 @@ use std::path::Path;
 
 use png::{BitDepth, ColorType, Compression, Encoder, PixelDimensions, Unit};
 
-use crate::depth_map::{MapGeometry, MapReader, TILE_SIDE_PX};
+use crate::depth_map::{BAND_ROWS, MapGeometry, MapReader, TILE_SIDE_PX, band, rectangles};
 use crate::error::{Error, Result};
 use crate::export::manifest::GrayScale;
 use crate::export::new_file::NewFile;
 use crate::export::parts::{Part, parts};
+
+/// Rows that are looked through at once.
+const PIECE_ROWS: usize = 4096;
 
 /// Writes `depth.png`, or `depth-0001.png` and so on, into `folder`.
 ///
@@ -36,9 +39,10 @@ pub fn write(map: &mut dyn MapReader, folder: &Path) -> Result<Option<GrayScale>
 
 fn smallest_and_largest(map: &mut dyn MapReader) -> Result<Option<GrayScale>> {
     let geometry = map.geometry();
+    let size_px = [geometry.width_px, geometry.height_px];
     let (mut min_mm, mut max_mm) = (f64::INFINITY, f64::NEG_INFINITY);
-    for column in (0..geometry.width_px).step_by(TILE_SIDE_PX) {
-        let window = map.window(column, 0, TILE_SIDE_PX.min(geometry.width_px - column), geometry.height_px)?;
+    for [column, row, width_px, height_px] in rectangles(size_px, [TILE_SIDE_PX, PIECE_ROWS]) {
+        let window = map.window(column, row, width_px, height_px)?;
         for z_mm in window.depth_mm.into_iter().filter(|z| z.is_finite()) {
             (min_mm, max_mm) = (min_mm.min(f64::from(z_mm)), max_mm.max(f64::from(z_mm)));
         }
@@ -60,11 +64,9 @@ fn write_part(map: &mut dyn MapReader, path: &Path, part: &Part, scale: Option<G
     }
     let mut writer = encoder.write_header().map_err(refused)?;
     let mut stream = writer.stream_writer().map_err(refused)?;
-    for row in (0..geometry.height_px).step_by(TILE_SIDE_PX) {
-        let height_px = TILE_SIDE_PX.min(geometry.height_px - row);
-        let window = map.window(part.first_column_px, row, part.width_px, height_px)?;
-        let bytes: Vec<u8> = window.depth_mm.iter().flat_map(|z| gray(*z, scale).to_be_bytes()).collect();
-        stream.write_all(&bytes).map_err(|e| Error::io(path, e))?;
+    for row in (0..geometry.height_px).step_by(BAND_ROWS) {
+        let pixels = band(map, part.columns(), row, [0; 2], |z_mm, _| gray(z_mm, scale).to_be_bytes())?;
+        stream.write_all(pixels.as_flattened()).map_err(|e| Error::io(path, e))?;
     }
     stream.finish().map_err(refused)?;
     writer.finish().map_err(refused)?;

@@ -8,7 +8,7 @@ use serde::{Deserialize, Serialize};
 
 use crate::error::{Error, Result};
 use crate::export::new_file::NewFile;
-use crate::rig::LineDirection;
+use crate::rig::{Camera, LineDirection};
 use crate::source::Image;
 use crate::stripe::Stripe;
 
@@ -47,15 +47,18 @@ pub struct LiveFrame {
 /// Writes the newest frame, now and then.
 pub struct LiveFrameWriter {
     folder: PathBuf,
+    /// Of the whole frames.
+    width_px: u32,
+    height_px: u32,
     last_s: Option<f64>,
 }
 
 impl LiveFrameWriter {
-    /// Makes `live/` in the product folder.
-    pub fn create(product_folder: &Path) -> Result<LiveFrameWriter> {
+    /// Makes `live/` in the product folder, for frames of this camera.
+    pub fn create(product_folder: &Path, camera: &Camera) -> Result<LiveFrameWriter> {
         let folder = product_folder.join(FOLDER);
         std::fs::create_dir_all(&folder).map_err(|e| Error::io(&folder, e))?;
-        Ok(LiveFrameWriter { folder, last_s: None })
+        Ok(LiveFrameWriter { folder, width_px: camera.width_px, height_px: camera.height_px, last_s: None })
     }
 
     /// Whether it is time for another frame.
@@ -63,7 +66,8 @@ impl LiveFrameWriter {
         self.last_s.is_none_or(|last_s| time_s - last_s >= INTERVAL_S)
     }
 
-    /// Writes a frame. Answers what was written: names inside the product folder.
+    /// Writes a frame, of which `image` is as much as is at hand: whole, or smaller already. Answers what was written:
+    /// names inside the product folder.
     ///
     /// # Errors
     /// What the disk says.
@@ -75,19 +79,18 @@ impl LiveFrameWriter {
         x_mm: Option<f64>,
     ) -> Result<Vec<String>> {
         self.last_s = Some(time_s);
-        let (width_px, height_px) = (image.width_px(), image.height_px());
-        let shrink = width_px.div_ceil(MOST_WIDTH_PX).min(height_px).max(1);
+        let shrink = image.width_px().div_ceil(MOST_WIDTH_PX).min(image.height_px()).max(1);
         let small = image.shrunk_bgr(shrink as usize);
         let mut jpeg = Vec::new();
         Encoder::new(&mut jpeg, QUALITY)
-            .encode(&small, (width_px / shrink) as u16, (height_px / shrink) as u16, ColorType::Bgr)
+            .encode(&small, (image.width_px() / shrink) as u16, (image.height_px() / shrink) as u16, ColorType::Bgr)
             .map_err(|e| Error::internal("live frame", e))?;
         let step = stripe.across_px.len().div_ceil(MOST_POSITIONS).max(1);
         let about = LiveFrame {
             frame,
             time_s,
-            width_px,
-            height_px,
+            width_px: self.width_px,
+            height_px: self.height_px,
             spots_px: stripe
                 .spots()
                 .filter(|(position, _)| position % step == 0)
@@ -95,8 +98,8 @@ impl LiveFrameWriter {
                 .collect(),
             rows_found: stripe.found(),
             rows: match stripe.line {
-                LineDirection::Vertical => height_px as usize,
-                LineDirection::Horizontal => width_px as usize,
+                LineDirection::Vertical => self.height_px as usize,
+                LineDirection::Horizontal => self.width_px as usize,
             },
             x_mm,
         };

@@ -3,7 +3,8 @@
 use std::collections::BTreeMap;
 use std::fs::{self, File};
 use std::io::Read;
-use std::path::Path;
+use std::path::{Path, PathBuf};
+use std::sync::atomic::{AtomicUsize, Ordering};
 
 use serde::{Deserialize, Serialize};
 use sha2::{Digest, Sha256};
@@ -11,6 +12,7 @@ use sha2::{Digest, Sha256};
 use crate::depth_map::MapGeometry;
 use crate::error::{Error, Result};
 use crate::export::new_file;
+use crate::motion::metric::Drift;
 
 /// The manifest's own name in the product folder.
 pub const FILE_NAME: &str = "manifest.json";
@@ -94,20 +96,24 @@ pub struct Quality {
     pub coverage: f64,
     /// Median over frames of the motion's residual, px.
     pub residual_px: Option<f64>,
+    /// How far the last frame's place may be off against the first one's; `None` where the way was broken, too short, or not the
+    /// image's.
+    #[serde(default)]
+    pub drift: Option<Drift>,
     /// Distance travelled, mm.
     pub travel_mm: f64,
     /// Duration of the run, s.
     pub duration_s: f64,
 }
 
-/// A stretch of frames without motion or without a stripe.
+/// A stretch of frames without motion, without a stripe, or not all on the map.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 pub struct Gap {
     /// First frame.
     pub first_frame: u32,
     /// Last frame.
     pub last_frame: u32,
-    /// `no_stripe` or `not_tracked`.
+    /// `no_stripe`, `not_tracked`, or `beyond_map`: the map's limits left something of them out.
     pub reason: String,
 }
 
@@ -216,13 +222,27 @@ fn hex(bytes: &[u8]) -> String {
 /// Measures and hashes every product in a folder and the folders inside it, in the order of their names
 /// (`tiles/depth/0/0_0.png`); not the manifest itself, nor hidden files.
 pub fn list_products(folder: &Path) -> Result<Vec<FileEntry>> {
-    let mut entries = Vec::new();
-    list_into(folder, "", &mut entries)?;
+    let mut files = Vec::new();
+    list_into(folder, "", &mut files)?;
+    files.sort();
+    // The large ones are few: each of two threads takes the next file until none is left.
+    let next = AtomicUsize::new(0);
+    let hash = || -> Result<Vec<FileEntry>> {
+        let taken = std::iter::from_fn(|| files.get(next.fetch_add(1, Ordering::Relaxed)));
+        taken.map(|(name, path)| FileEntry::of(path, name.clone())).collect()
+    };
+    let mut entries = std::thread::scope(|scope| {
+        let beside = scope.spawn(hash);
+        let mut entries = hash()?;
+        entries.extend(beside.join().map_err(|_| Error::internal("manifest", "a thread panicked"))??);
+        Ok::<_, Error>(entries)
+    })?;
     entries.sort_by(|a, b| a.name.cmp(&b.name));
     Ok(entries)
 }
 
-fn list_into(folder: &Path, prefix: &str, entries: &mut Vec<FileEntry>) -> Result<()> {
+/// Name and path of each product.
+fn list_into(folder: &Path, prefix: &str, files: &mut Vec<(String, PathBuf)>) -> Result<()> {
     for item in fs::read_dir(folder).map_err(|e| Error::io(folder, e))? {
         let item = item.map_err(|e| Error::io(folder, e))?;
         let name = format!("{prefix}{}", item.file_name().to_string_lossy());
@@ -231,9 +251,9 @@ fn list_into(folder: &Path, prefix: &str, entries: &mut Vec<FileEntry>) -> Resul
         }
         let path = item.path();
         if item.file_type().map_err(|e| Error::io(&path, e))?.is_dir() {
-            list_into(&path, &format!("{name}/"), entries)?;
+            list_into(&path, &format!("{name}/"), files)?;
         } else {
-            entries.push(FileEntry::of(&path, name)?);
+            files.push((name, path));
         }
     }
     Ok(())

@@ -4,6 +4,7 @@
 //! that fits is a vertex; where nothing was measured there is a hole. The texture comes from the tiles and is a JPEG
 //! inside the file.
 
+use std::ops::RangeInclusive;
 use std::path::Path;
 
 use jpeg_encoder::{ColorType, Encoder};
@@ -38,18 +39,21 @@ pub struct MeshFacts {
     pub textured: bool,
 }
 
-/// Writes the mesh of a product folder's map, with at most about so many vertices.
+/// All of the way.
+pub const ALL_MM: RangeInclusive<f64> = f64::NEG_INFINITY..=f64::INFINITY;
+
+/// Writes the mesh of a stretch of a product folder's map, world x in mm, with at most about so many vertices.
 ///
 /// # Errors
-/// A folder without a map, a damaged one, a map without a surface; a full disk.
-pub fn write(path: &Path, product_folder: &Path, vertices: usize) -> Result<MeshFacts> {
+/// A folder without a map, a damaged one, a stretch without a surface; a full disk.
+pub fn write(path: &Path, product_folder: &Path, vertices: usize, x_mm: &RangeInclusive<f64>) -> Result<MeshFacts> {
     let map_path = product_folder.join("depth.tif");
-    let level = level_of_at_most(&map_path, vertices)?;
+    let level = level_of_at_most(&map_path, vertices, x_mm)?;
     let mesh = Mesh::of(&level);
     if mesh.indices.is_empty() {
         return Err(Error::input(map_path.display().to_string(), "no surface in it", "a map with measured neighbours"));
     }
-    let texture = Texture::read(product_folder)?;
+    let texture = Texture::read(product_folder, x_mm)?;
     let facts = MeshFacts {
         vertices: mesh.pixels.len(),
         triangles: mesh.indices.len() / 3,
@@ -113,23 +117,32 @@ struct Texture {
 }
 
 impl Texture {
-    /// The largest level of the tiles that is small enough; `None` in a folder without tiles.
-    fn read(product_folder: &Path) -> Result<Option<Texture>> {
+    /// The largest level of the tiles that is small enough, as far as it shows a stretch; `None` in a folder without tiles.
+    fn read(product_folder: &Path, x_mm: &RangeInclusive<f64>) -> Result<Option<Texture>> {
         if !product_folder.join("tiles/tiles.json").exists() {
             return Ok(None);
         }
         let index = TilesIndex::load(product_folder)?;
         let side = index.tile_side_px;
         let across = |first: i64, last: i64| (last - first + 1).max(0) as usize * side;
+        // The tiles of a level that a stretch touches, and one more where it ends just between two.
+        let within = |level: &TileLevel| {
+            let column = |x_mm: f64| (x_mm - index.grid.x0_mm) / (level.mm_per_px * side as f64);
+            TileLevel {
+                first_column: level.first_column.max((column(*x_mm.start()) - 0.01).floor() as i64),
+                last_column: level.last_column.min((column(*x_mm.end()) + 0.01).floor() as i64),
+                ..*level
+            }
+        };
         let size = |level: &TileLevel| {
             (across(level.first_column, level.last_column), across(level.first_row, level.last_row))
         };
-        let fits = |level: &&TileLevel| {
+        let fits = |level: &TileLevel| {
             let (width, height) = size(level);
             (1..=TEXTURE_SIDE_PX).contains(&width) && (1..=TEXTURE_SIDE_PX).contains(&height)
         };
-        let Some(level) = index.levels.iter().find(fits) else { return Ok(None) };
-        let (width_px, height_px) = size(level);
+        let Some(level) = index.levels.iter().map(within).find(fits) else { return Ok(None) };
+        let (width_px, height_px) = size(&level);
         let mut rgb = vec![128; 3 * width_px * height_px];
         for row in level.first_row..=level.last_row {
             for column in level.first_column..=level.last_column {

@@ -1,5 +1,7 @@
 //! Wide maps as numbered parts: PNG and JPEG readers give up long before a tunnel ends.
 
+use std::ops::Range;
+
 /// Widest PNG or JPEG map, px.
 pub const MAX_PART_WIDTH_PX: usize = 32_768;
 
@@ -12,6 +14,13 @@ pub struct Part {
     pub first_column_px: usize,
     /// Columns.
     pub width_px: usize,
+}
+
+impl Part {
+    /// The map's columns that it holds.
+    pub fn columns(&self) -> Range<usize> {
+        self.first_column_px..self.first_column_px + self.width_px
+    }
 }
 
 /// The files that a map of `width_px` columns needs, from left to right.

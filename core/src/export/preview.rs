@@ -18,7 +18,7 @@ use crate::error::{Error, Result};
 use crate::export::canvas::Canvas;
 
 use layout::{Layout, WIDTH_PX};
-use reduce::Reduced;
+use reduce::{Between, Reduced};
 use thumbnail::Thumbnail;
 
 /// Share of the depths beyond each end of the colours.
@@ -120,22 +120,25 @@ fn draw_map(canvas: &mut Canvas, layout: &Layout, map: &Reduced, shades: &[f32],
     let range = range.unwrap_or(Range { near_mm: 0.0, far_mm: 1.0 });
     let ramp = colour::Ramp::new();
     let scale = layout.mm_per_px / map.mm_per_px;
+    // Centres of pixels are at whole numbers in the map, at halves in the ratio of sizes.
+    let place = |px: usize, length_px: usize| Between::of((px as f64 + 0.5) * scale - 0.5, length_px);
+    let rows: Vec<Between> = (0..layout.strip_height_px).map(|row| place(row, map.height_px)).collect();
     for strip in 0..layout.strips {
-        let (left, top) = (layout.strip_left_px() as i64, layout.strip_top_px(strip) as i64);
-        for row in 0..layout.strip_height_px {
-            for column in 0..layout.strip_width_px {
-                // Centres of pixels are at whole numbers in the map, at halves in the ratio of sizes.
-                let x = ((strip * layout.strip_width_px + column) as f64 + 0.5) * scale - 0.5;
-                let y = (row as f64 + 0.5) * scale - 0.5;
-                let (at_x, at_y) = (left + column as i64, top + row as i64);
-                let z_mm = Reduced::at(&map.depth_mm, map.width_px, map.height_px, x, y);
+        let (left, top) = (layout.strip_left_px(), layout.strip_top_px(strip));
+        let first = strip * layout.strip_width_px;
+        let columns: Vec<Between> =
+            (first..first + layout.strip_width_px).map(|column| place(column, map.width_px)).collect();
+        for (row, y) in rows.iter().enumerate() {
+            for (column, x) in columns.iter().enumerate() {
+                let (at_x, at_y) = ((left + column) as i64, (top + row) as i64);
+                let z_mm = reduce::between(&map.depth_mm, map.width_px, *x, *y);
                 if z_mm.is_nan() {
                     canvas.hatch(at_x, at_y);
                     continue;
                 }
                 let share = (f64::from(z_mm) - range.near_mm) / (range.far_mm - range.near_mm);
-                let shade = Reduced::at(shades, map.width_px, map.height_px, x, y);
-                canvas.blend(at_x, at_y, colour::shaded(ramp.at(share), shade), 1.0);
+                let shade = reduce::between(shades, map.width_px, *x, *y);
+                canvas.put(at_x, at_y, colour::shaded(ramp.at(share), shade));
             }
         }
     }

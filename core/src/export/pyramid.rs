@@ -1,8 +1,7 @@
 //! A map cut into tiles at full size and at every half of it, in one pass and in bounded memory.
 //!
-//! The map is read in columns of tiles from left to right. Each column is halved and waits for its
-//! neighbour; two halves make a column of the next level, and so on. At any time each level holds at most
-//! one column, so the memory depends on the map's height, not on its length.
+//! A tile of a level is made of the four below it, and these one after the other: at any time each level holds one tile,
+//! so the memory depends neither on the map's length nor on its height.
 
 use std::ops::Range;
 
@@ -33,20 +32,24 @@ pub(super) struct TileAddress {
     pub row: i64,
 }
 
-/// Gives every tile of every level once: columns from left to right, in each column from top to bottom; a tile
-/// of level n + 1 after those that it is made of. Pixels of the upper levels are the mean of what was measured.
+/// Gives every tile of every level once, a tile of level n + 1 after those that it is made of. Pixels of the upper levels
+/// are the mean of what was measured.
 pub(super) fn for_each_tile(
     map: &mut dyn MapReader,
     layout: &Layout,
-    take: &mut dyn FnMut(TileAddress, MapWindow) -> Result<()>,
+    take: &mut dyn FnMut(TileAddress, &MapWindow) -> Result<()>,
 ) -> Result<()> {
     let geometry = map.geometry();
-    let mut cascade = Cascade { layout, take, waiting: (0..layout.levels).map(|_| None).collect() };
-    for tile_column in tile_range(layout.first_column_px, geometry.width_px, layout.side_px) {
-        let column = read_column(map, layout, tile_column)?;
-        cascade.give(0, column)?;
+    let columns = tile_range(layout.first_column_px, geometry.width_px, layout.side_px);
+    let rows = tile_range(layout.first_row_px, geometry.height_px, layout.side_px);
+    let mut cutter = Cutter { map, layout, columns, rows, take };
+    let top = layout.levels.saturating_sub(1);
+    for column in cutter.columns_of(top) {
+        for row in cutter.rows_of(top) {
+            cutter.tile(TileAddress { level: top, column, row })?;
+        }
     }
-    cascade.finish()
+    Ok(())
 }
 
 /// The tiles that `length_px` pixels from `first_px` on touch.
@@ -55,68 +58,73 @@ pub(super) fn tile_range(first_px: i64, length_px: usize, side_px: usize) -> Ran
     first_px.div_euclid(side)..(first_px + length_px as i64 - 1).div_euclid(side) + 1
 }
 
-/// A column of tiles of one level, one pixel array.
-struct Column {
-    tile_column: i64,
-    tile_rows: Range<i64>,
-    pixels: MapWindow,
-}
-
-struct Cascade<'a> {
+struct Cutter<'a> {
+    map: &'a mut dyn MapReader,
     layout: &'a Layout,
-    take: &'a mut dyn FnMut(TileAddress, MapWindow) -> Result<()>,
-    /// Per level a column of which the left half is there.
-    waiting: Vec<Option<Column>>,
+    /// The tiles of level 0.
+    columns: Range<i64>,
+    rows: Range<i64>,
+    take: &'a mut dyn FnMut(TileAddress, &MapWindow) -> Result<()>,
 }
 
-impl Cascade<'_> {
-    fn give(&mut self, level: u32, column: Column) -> Result<()> {
-        let side_px = self.layout.side_px;
-        for (index, row) in column.tile_rows.clone().enumerate() {
-            let tile = rows_of(&column.pixels, index * side_px, side_px);
-            (self.take)(TileAddress { level, column: column.tile_column, row }, tile)?;
-        }
-        if level + 1 >= self.layout.levels {
-            return Ok(());
-        }
-        let parent_rows = column.tile_rows.start.div_euclid(2)..(column.tile_rows.end - 1).div_euclid(2) + 1;
-        let parent = self.waiting[level as usize + 1].get_or_insert_with(|| Column {
-            tile_column: column.tile_column.div_euclid(2),
-            pixels: MapWindow::empty(side_px, side_px * (parent_rows.end - parent_rows.start) as usize),
-            tile_rows: parent_rows.clone(),
-        });
-        let right = column.tile_column.rem_euclid(2) == 1;
-        let half = halved(&column.pixels);
-        let first_row = (column.tile_rows.start - 2 * parent_rows.start) as usize * side_px / 2;
-        paste(&mut parent.pixels, &half, if right { side_px / 2 } else { 0 }, first_row);
-        if right { self.hand_on(level + 1) } else { Ok(()) }
+impl Cutter<'_> {
+    fn columns_of(&self, level: u32) -> Range<i64> {
+        above(&self.columns, level)
     }
 
-    fn hand_on(&mut self, level: u32) -> Result<()> {
-        match self.waiting[level as usize].take() {
-            Some(column) => self.give(level, column),
-            None => Ok(()),
-        }
+    fn rows_of(&self, level: u32) -> Range<i64> {
+        above(&self.rows, level)
     }
 
-    /// The right neighbours that never came stay empty.
-    fn finish(mut self) -> Result<()> {
-        (1..self.layout.levels).try_for_each(|level| self.hand_on(level))
+    /// Gives the tiles that a tile is made of, and then the tile.
+    fn tile(&mut self, address: TileAddress) -> Result<MapWindow> {
+        let tile = match address.level {
+            0 => self.read(address.column, address.row)?,
+            _ => self.joined(address)?,
+        };
+        (self.take)(address, &tile)?;
+        Ok(tile)
+    }
+
+    fn joined(&mut self, address: TileAddress) -> Result<MapWindow> {
+        let (side_px, level) = (self.layout.side_px, address.level - 1);
+        let (columns, rows) = (self.columns_of(level), self.rows_of(level));
+        let mut tile = MapWindow::empty(side_px, side_px);
+        for (right, down) in [(0, 0), (0, 1), (1, 0), (1, 1)] {
+            let (column, row) = (2 * address.column + right, 2 * address.row + down);
+            if columns.contains(&column) && rows.contains(&row) {
+                let quarter = halved(&self.tile(TileAddress { level, column, row })?);
+                paste(&mut tile, &quarter, right as usize * side_px / 2, down as usize * side_px / 2);
+            }
+        }
+        Ok(tile)
+    }
+
+    fn read(&mut self, tile_column: i64, tile_row: i64) -> Result<MapWindow> {
+        let (geometry, layout) = (self.map.geometry(), self.layout);
+        let side = layout.side_px as i64;
+        // The map's pixels that lie in the tile: the first, the one after the last, and where the first lies in it.
+        let within = |tile: i64, first_px: i64, length_px: usize| {
+            let start = (tile * side - first_px).max(0);
+            let end = ((tile + 1) * side - first_px).min(length_px as i64);
+            (start as usize, (end - start) as usize, (start + first_px - tile * side) as usize)
+        };
+        let (column, width, left) = within(tile_column, layout.first_column_px, geometry.width_px);
+        let (row, height, top) = within(tile_row, layout.first_row_px, geometry.height_px);
+        let window = self.map.window(column, row, width, height)?;
+        if (width, height) == (layout.side_px, layout.side_px) {
+            return Ok(window);
+        }
+        let mut tile = MapWindow::empty(layout.side_px, layout.side_px);
+        paste(&mut tile, &window, left, top);
+        Ok(tile)
     }
 }
 
-fn read_column(map: &mut dyn MapReader, layout: &Layout, tile_column: i64) -> Result<Column> {
-    let geometry = map.geometry();
-    let side = layout.side_px as i64;
-    let tile_rows = tile_range(layout.first_row_px, geometry.height_px, layout.side_px);
-    let mut pixels = MapWindow::empty(layout.side_px, layout.side_px * (tile_rows.end - tile_rows.start) as usize);
-    let start = (tile_column * side - layout.first_column_px).max(0);
-    let end = ((tile_column + 1) * side - layout.first_column_px).min(geometry.width_px as i64);
-    let window = map.window(start as usize, 0, (end - start) as usize, geometry.height_px)?;
-    let to_column = start + layout.first_column_px - tile_column * side;
-    let to_row = layout.first_row_px - tile_rows.start * side;
-    paste(&mut pixels, &window, to_column as usize, to_row as usize);
-    Ok(Column { tile_column, tile_rows, pixels })
+/// A range of tiles of level 0 as one of a higher level.
+fn above(range: &Range<i64>, level: u32) -> Range<i64> {
+    // A shift of a negative number rounds down: the tile that holds it.
+    range.start >> level..((range.end - 1) >> level) + 1
 }
 
 fn paste(into: &mut MapWindow, from: &MapWindow, column_px: usize, row_px: usize) {
@@ -125,16 +133,6 @@ fn paste(into: &mut MapWindow, from: &MapWindow, column_px: usize, row_px: usize
         let start = (row_px + row) * into.width_px + column_px;
         into.depth_mm[start..start + from.width_px].copy_from_slice(&from.depth_mm[source.clone()]);
         into.texture[start..start + from.width_px].copy_from_slice(&from.texture[source]);
-    }
-}
-
-fn rows_of(pixels: &MapWindow, first_row_px: usize, height_px: usize) -> MapWindow {
-    let range = first_row_px * pixels.width_px..(first_row_px + height_px) * pixels.width_px;
-    MapWindow {
-        width_px: pixels.width_px,
-        height_px,
-        depth_mm: pixels.depth_mm[range.clone()].to_vec(),
-        texture: pixels.texture[range].to_vec(),
     }
 }
 
@@ -185,7 +183,7 @@ mod tests {
     fn pyramid(map: &mut GridMap, layout: Layout) -> BTreeMap<TileAddress, MapWindow> {
         let mut tiles = BTreeMap::new();
         for_each_tile(map, &layout, &mut |address, tile| {
-            assert!(tiles.insert(address, tile).is_none(), "{address:?} came twice");
+            assert!(tiles.insert(address, tile.clone()).is_none(), "{address:?} came twice");
             Ok(())
         })
         .expect("pyramid");

@@ -65,7 +65,8 @@ impl ResidualWriter {
 
     /// Writes the file; says whether there was anything to write.
     pub fn finish(mut self) -> Result<bool> {
-        let Some(mut finished) = self.map.as_mut().and_then(SurfaceMap::finished) else { return Ok(false) };
+        let finished = self.map.as_mut().map(SurfaceMap::finished).transpose()?.flatten();
+        let Some(mut finished) = finished else { return Ok(false) };
         depth_tif::write(&mut finished, &self.path)?;
         Ok(true)
     }

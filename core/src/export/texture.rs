@@ -5,11 +5,12 @@
 //! [`MAX_PART_WIDTH_PX`](crate::export::parts::MAX_PART_WIDTH_PX) become numbered parts.
 
 use std::cell::RefCell;
+use std::iter::repeat;
 use std::path::Path;
 
 use jpeg_encoder::{ColorType, Encoder, EncodingError, ImageBuffer, JpegColorType, rgb_to_ycbcr};
 
-use crate::depth_map::{MapReader, MapWindow, TILE_SIDE_PX};
+use crate::depth_map::{BAND_ROWS, MapReader, band};
 use crate::error::{Error, Result};
 use crate::export::new_file::NewFile;
 use crate::export::parts::{Part, parts};
@@ -47,7 +48,7 @@ pub(super) fn small_jpeg(width_px: usize, height_px: usize, texture: &[Option<[u
 
 fn write_part(map: &mut dyn MapReader, path: &Path, part: &Part) -> Result<()> {
     let mut file = NewFile::create(path)?;
-    let band = Band { map, part, first_row_px: 0, pixels: MapWindow::empty(part.width_px, 0), failed: None };
+    let band = Band { map, part, first_row_px: 0, pixels: Vec::new(), failed: None };
     let image = BandedImage(RefCell::new(band));
     let outcome = Encoder::new(&mut file, QUALITY).encode_image(&image);
     if let Some(error) = image.0.into_inner().failed {
@@ -65,30 +66,27 @@ struct Band<'a> {
     map: &'a mut dyn MapReader,
     part: &'a Part,
     first_row_px: usize,
-    pixels: MapWindow,
+    /// Whole rows; none before the first was asked for, or after a failure.
+    pixels: Vec<[u8; 3]>,
     /// The encoder's way of asking has no way to say no: the reason waits here.
     failed: Option<Error>,
 }
 
 impl Band<'_> {
-    fn row(&mut self, row_px: usize) -> &[Option<[u8; 3]>] {
-        let held = self.first_row_px..self.first_row_px + self.pixels.height_px;
-        if !held.contains(&row_px) {
-            self.first_row_px = row_px / TILE_SIDE_PX * TILE_SIDE_PX;
-            self.pixels = self.read().unwrap_or_else(|error| {
-                self.failed.get_or_insert(error);
-                MapWindow::empty(self.part.width_px, TILE_SIDE_PX)
-            });
+    fn row(&mut self, row_px: usize) -> &[[u8; 3]] {
+        let width_px = self.part.width_px;
+        let held = self.first_row_px..self.first_row_px + self.pixels.len() / width_px;
+        if !held.contains(&row_px) && self.failed.is_none() {
+            self.first_row_px = row_px / BAND_ROWS * BAND_ROWS;
+            // The last band goes before the next comes.
+            self.pixels = Vec::new();
+            match band(self.map, self.part.columns(), self.first_row_px, NO_IMAGE, |_, rgb| rgb.unwrap_or(NO_IMAGE)) {
+                Ok(pixels) => self.pixels = pixels,
+                Err(error) => self.failed = Some(error),
+            }
         }
-        let start = (row_px - self.first_row_px) * self.part.width_px;
-        &self.pixels.texture[start..start + self.part.width_px]
-    }
-
-    fn read(&mut self) -> Result<MapWindow> {
-        if self.failed.is_some() {
-            return Ok(MapWindow::empty(self.part.width_px, TILE_SIDE_PX));
-        }
-        self.map.window(self.part.first_column_px, self.first_row_px, self.part.width_px, TILE_SIDE_PX)
+        let start = (row_px - self.first_row_px) * width_px;
+        self.pixels.get(start..start + width_px).unwrap_or_default()
     }
 }
 
@@ -108,9 +106,11 @@ impl ImageBuffer for &BandedImage<'_> {
     }
 
     fn fill_buffers(&self, y: u16, buffers: &mut [Vec<u8>; 4]) {
-        for colour in self.0.borrow_mut().row(usize::from(y)) {
-            let [red, green, blue] = colour.unwrap_or(NO_IMAGE);
-            let (luma, cb, cr) = rgb_to_ycbcr(red, green, blue);
+        let mut band = self.0.borrow_mut();
+        let width_px = band.part.width_px;
+        // The encoder wants a row whatever happened; what it makes of it is thrown away.
+        for [red, green, blue] in band.row(usize::from(y)).iter().chain(repeat(&NO_IMAGE)).take(width_px) {
+            let (luma, cb, cr) = rgb_to_ycbcr(*red, *green, *blue);
             buffers[0].push(luma);
             buffers[1].push(cb);
             buffers[2].push(cr);
@@ -123,7 +123,7 @@ mod tests {
     use std::io::Cursor;
 
     use super::*;
-    use crate::depth_map::{GridMap, MapGeometry};
+    use crate::depth_map::{GridMap, MapGeometry, MapWindow};
     use crate::export::parts::MAX_PART_WIDTH_PX;
 
     fn read(path: &Path) -> (usize, usize, Vec<u8>) {

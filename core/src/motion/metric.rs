@@ -18,4 +18,4 @@ mod patch;
 mod pose;
 mod view;
 
-pub use odometry::{Motion, Odometry, SettledPose};
+pub use odometry::{Drift, Motion, Odometry, SettledPose};

@@ -1,7 +1,7 @@
 //! What completes a job's archive: everything from which it can be run again.
 
 use super::Request;
-use crate::depth_map::{FinishedMap, MapReader};
+use crate::depth_map::MapReader;
 use crate::error::{Error, Result};
 use crate::export::archive_mcap::ArchiveWriter;
 use crate::export::manifest::Manifest;
@@ -29,7 +29,7 @@ impl ArchivedJob<'_> {
     pub(super) fn complete(
         &self,
         mut archive: ArchiveWriter,
-        map: Option<&mut FinishedMap<'_>>,
+        map: Option<&mut dyn MapReader>,
         warnings: &[String],
     ) -> Result<Option<String>> {
         self.add_poses(&mut archive)?;

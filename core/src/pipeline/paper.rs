@@ -1,7 +1,5 @@
 //! The order of the publication's stages.
 
-use std::sync::Arc;
-
 use super::products::Products;
 use super::reading::{self, Seen};
 use super::{Cargo, Colours, Picture, Run};
@@ -80,7 +78,7 @@ impl HeldFrame {
             Colours::Strip(TextureStrip::cut(&frame.image, line, px, step_px, offsets_px))
         });
         let picture = products.wants_picture(frame.time_s).then_some(Picture {
-            image: Arc::new(frame.image),
+            image: frame.image,
             effective_area: steps.effective_area,
             row_threshold: steps.row_threshold,
         });

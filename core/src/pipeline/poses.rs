@@ -5,7 +5,7 @@ use nalgebra::{Isometry3, Point3};
 use super::Request;
 use crate::error::Result;
 use crate::geometry::WorldFromCamera;
-use crate::motion::metric::{Motion, Odometry, SettledPose};
+use crate::motion::metric::{Drift, Motion, Odometry, SettledPose};
 use crate::motion::track::{GivenPose, PoseTrack, TrackUse};
 use crate::motion::{Shift, start_pose};
 use crate::rig::Rig;
@@ -91,6 +91,14 @@ impl<'a> Poses<'a> {
         match &mut self.way {
             Way::Image(odometry) => odometry.take_settled(),
             Way::Track(poses) => std::mem::take(&mut poses.settled),
+        }
+    }
+
+    /// How far the last pose may be off against the first one, where the image tells it.
+    pub(super) fn drift(&self) -> Option<Drift> {
+        match &self.way {
+            Way::Image(odometry) => odometry.drift(),
+            Way::Track(_) => None,
         }
     }
 

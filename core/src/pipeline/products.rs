@@ -1,35 +1,29 @@
 //! The products of a job: what is written while the frames go by, and what is written at the end.
 
 use std::path::Path;
-use std::time::{Duration, Instant};
 
 use super::archiving::ArchivedJob;
+use super::growing_map::GrowingMap;
 use super::laz::LazThread;
+use super::maps::{self, Maps};
 use super::progress::Progress;
-use super::quality::QualityCounter;
-use super::{Cargo, Colours, Event, Newest, ProductGroup, Request, Timings};
-use crate::defects::{self, Chainage, Findings, Sampling};
-use crate::depth_map::sheet::Sheet;
-use crate::depth_map::strips::{add_strip, strip_grid};
-use crate::depth_map::{FinishedMap, Grid, MapReader, SharedMap, SurfaceMap};
+use super::quality::{QualityCounter, warn_of_quality};
+use super::{Cargo, Event, Newest, ProductGroup, Request, Timings};
+use crate::defects::{Findings, Sampling};
+use crate::depth_map::{FinishedMap, MapReader, SharedMap, SurfaceMap};
 use crate::error::{Error, Result};
 use crate::export::archive_mcap::ArchiveWriter;
 use crate::export::cloud_ply::CloudPlyWriter;
 use crate::export::live_frame::{self, LiveFrameWriter};
-use crate::export::manifest::{
-    FileEntry, Gap, GrayScale, Manifest, Quality, SCHEMA_VERSION, Stretch, list_products, sha256_of_bytes,
-};
+use crate::export::manifest::{FileEntry, Manifest, SCHEMA_VERSION, Stretch, list_products, sha256_of_bytes};
 use crate::export::npy::NpyWriter;
-use crate::export::preview::{self, Picture, PreviewText};
+use crate::export::preview::Picture;
 use crate::export::report::{self, ReportRun};
-use crate::export::residual_tif::{self, ResidualWriter};
-use crate::export::tiles::{TileGrid, TileWriter};
+use crate::export::tiles::TileWriter;
 use crate::export::trajectory_csv::{TrajectoryRow, TrajectoryWriter};
-use crate::export::{defect_list, depth_png, depth_tif, sections_csv, texture};
-use crate::motion::track::TrackUse;
-use crate::recipe::{Codes, DefectOptions, Method};
+use crate::recipe::Method;
 use crate::recording::{FrameSteps, RecordedRun, Recordings, Segment};
-use crate::rig::{LineDirection, Rig};
+use crate::rig::LineDirection;
 use crate::source::{self, Beside, SourceInfo};
 use crate::surface::{Placed, SurfacePoint};
 
@@ -40,9 +34,7 @@ const SEGMENTS: &str = "recording";
 pub(super) struct Products<'a> {
     request: &'a Request,
     beside: &'a Beside,
-    map: Option<SurfaceMap>,
-    /// What lays profiles on the map; with method `metric`.
-    sheet: Option<Sheet>,
+    map: GrowingMap,
     tiles: Option<TileWriter>,
     trajectory: Option<TrajectoryWriter>,
     cloud: Option<CloudPlyWriter>,
@@ -54,6 +46,8 @@ pub(super) struct Products<'a> {
     /// The robot still walks.
     watched: bool,
     frames: u64,
+    /// Mean width of the line at half of its height, px; 0 with method `paper`.
+    line_width_px: f64,
 }
 
 impl<'a> Products<'a> {
@@ -81,8 +75,7 @@ impl<'a> Products<'a> {
         Ok(Products {
             request,
             beside,
-            map: None,
-            sheet: None,
+            map: GrowingMap::default(),
             tiles: None,
             trajectory: make(wanted(ProductGroup::Trajectory), || {
                 TrajectoryWriter::create(&folder.join("trajectory.csv"))
@@ -94,9 +87,10 @@ impl<'a> Products<'a> {
             })?,
             recorder: make(wanted(ProductGroup::Recording), recorder)?,
             archive: make(wanted(ProductGroup::Archive), archive)?,
-            live: make(request.live_segments, || LiveFrameWriter::create(folder))?,
+            live: make(request.live_segments, || LiveFrameWriter::create(folder, &rig.camera))?,
             watched: info.still_open,
             frames: 0,
+            line_width_px: 0.0,
         })
     }
 
@@ -146,7 +140,11 @@ impl<'a> Products<'a> {
         let (measured, cargo) = (&placed.measured, &placed.measured.cargo);
         self.frames += 1;
         let points = surface_points(placed);
-        self.add_to_map(placed, &points)?;
+        if let Some(grid) = self.map.add(self.request, placed, &points)?
+            && self.request.products.contains(&ProductGroup::Tiles)
+        {
+            self.tiles = Some(TileWriter::create(&self.request.out_dir, grid)?);
+        }
         if let Some(stripes) = &mut self.stripes {
             stripes.push_row(&cargo.stripe.across_px)?;
         }
@@ -170,7 +168,7 @@ impl<'a> Products<'a> {
             let segments = recorder.log_frame(&FrameSteps {
                 frame_index: measured.frame,
                 time_s: measured.time_s,
-                image: picture.map(|p| &*p.image),
+                image: picture.map(|p| &p.image),
                 effective_area: picture.and_then(|p| p.effective_area.as_deref()),
                 row_threshold: picture.and_then(|p| p.row_threshold.as_deref()),
                 stripe: &cargo.stripe,
@@ -200,66 +198,9 @@ impl<'a> Products<'a> {
         live.put((measured.frame, measured.time_s), &picture.image, &cargo.stripe, x_mm)
     }
 
-    fn add_to_map(&mut self, placed: &Placed<Cargo>, points: &[SurfacePoint]) -> Result<()> {
-        self.begin_map(placed)?;
-        let Some(map) = &mut self.map else { return Ok(()) };
-        let colours = &placed.measured.cargo.colours;
-        match &mut self.sheet {
-            Some(sheet) => {
-                let positions: Vec<u32> =
-                    placed.measured.profile.points.iter().map(|point| point.line_position).collect();
-                let colours = match colours {
-                    Colours::Wall(wall) => Some(wall),
-                    _ => None,
-                };
-                sheet.add(map, points, &positions, placed.part, colours)
-            }
-            None => {
-                let strip = match colours {
-                    Colours::Strip(strip) => Some(strip),
-                    _ => None,
-                };
-                add_strip(map, self.request.rig.laser.line, placed, strip)
-            }
-        }
-    }
-
-    /// The map begins with the first placed frame that has points: their distance gives the pixel's size.
-    fn begin_map(&mut self, placed: &Placed<Cargo>) -> Result<()> {
-        let (rig, options) = (&self.request.rig, &self.request.recipe.map);
-        let (None, Some(z_mm), Some(pose)) =
-            (&self.map, placed.measured.profile.median_z_mm(), &placed.world_from_camera)
-        else {
-            return Ok(());
-        };
-        let grid = match &placed.strip {
-            Some(place) => {
-                // Grid column 0 is where this frame's line lies.
-                let mut grid = strip_grid(rig, z_mm, line_x_mm(rig, z_mm) + pose.translation.x);
-                grid.x_mm -= place.travel_px.round() * grid.mm_per_px;
-                grid
-            }
-            None => {
-                let mm_per_px = match options.mm_per_px {
-                    size if size > 0.0 => size,
-                    _ => round_up_125(z_mm / rig.camera.fx_px.min(rig.camera.fy_px)),
-                };
-                self.sheet = Some(Sheet::new(Grid { x_mm: 0.0, y_mm: 0.0, mm_per_px }, options.bridge_mm));
-                Grid { x_mm: 0.0, y_mm: 0.0, mm_per_px }
-            }
-        };
-        let folder = &self.request.out_dir;
-        self.map = Some(SurfaceMap::create(grid, options.tiles_in_memory as usize, folder)?);
-        if self.request.products.contains(&ProductGroup::Tiles) {
-            let grid = TileGrid { x0_mm: grid.x_mm, y0_mm: grid.y_mm, mm_per_px: grid.mm_per_px };
-            self.tiles = Some(TileWriter::create(folder, grid)?);
-        }
-        Ok(())
-    }
-
     /// Hands tiles out while the run goes on, now and then, where people can look. Answers what changed.
     fn write_changed_tiles(&mut self) -> Result<Vec<String>> {
-        let (Some(map), Some(tiles)) = (&mut self.map, &mut self.tiles) else { return Ok(Vec::new()) };
+        let (Some(map), Some(tiles)) = (self.map.begun(), &mut self.tiles) else { return Ok(Vec::new()) };
         if !self.request.live_segments || !self.frames.is_multiple_of(u64::from(self.request.recipe.map.tile_frames)) {
             return Ok(Vec::new());
         }
@@ -267,6 +208,11 @@ impl<'a> Products<'a> {
             tiles.put(index.0, index.1, &map.tile_window(index)?)?;
         }
         tiles.publish()
+    }
+
+    /// How wide the line was, for the blur of what was measured with it.
+    pub(super) fn note_line_width(&mut self, width_px: f64) {
+        self.line_width_px = width_px;
     }
 
     fn announcements(&self, segments: Vec<Segment>) -> Vec<Event> {
@@ -287,19 +233,25 @@ impl<'a> Products<'a> {
         progress: &mut Progress<'_, '_>,
     ) -> Result<Manifest> {
         let request = self.request;
-        let mut map = self.map.take();
-        let mut finished = map.as_mut().and_then(SurfaceMap::finished);
+        let (mut map, beyond) = std::mem::take(&mut self.map).finish();
+        let mut finished = map.as_mut().map(SurfaceMap::finished).transpose()?.flatten();
         let geometry = finished.as_ref().map(|map| map.geometry());
         let coverage = finished.as_ref().map_or(0.0, FinishedMap::coverage);
-        let (quality, gaps, resolution) = quality.finish(&request.rig, coverage);
-        let given = request.track_use(self.beside);
-        warn_of_quality(&quality, &gaps, request, given, progress)?;
+        let (quality, mut gaps, resolution) = quality.finish(&request.rig, coverage);
+        warn_of_quality(&quality, &gaps, request, request.track_use(self.beside), progress)?;
+        beyond.warning(request).into_iter().try_for_each(|warning| progress.warn(warning))?;
+        gaps.extend(beyond.gaps);
         let sampling = resolution.map_or_else(Sampling::default, |r| Sampling {
             profile_step_mm: r.r_lateral_mm.unwrap_or(0.0),
             line_step_mm: r.r_vertical_mm,
+            line_width_mm: self.line_width_px * r.r_vertical_mm,
         });
-        let Maps { gray, picture, found } =
-            timings.time("maps", || self.write_maps(finished.as_mut(), sampling, progress))?;
+        let shared = finished.as_mut().map(SharedMap::new);
+        let tiles = self.tiles.take();
+        let Maps { gray, picture, found } = match &shared {
+            Some(map) => timings.time("maps", || maps::write(request, map, tiles, sampling, progress))?,
+            None => Maps::default(),
+        };
         if let Some((_, time)) = &found {
             timings.add("defects", *time);
         }
@@ -337,13 +289,11 @@ impl<'a> Products<'a> {
             timings_s: std::collections::BTreeMap::new(),
             products: Vec::new(),
         };
-        if let (Some((findings, _)), Some(map), true) = (&found, &mut finished, self.wants(ProductGroup::Report)) {
-            progress.step("report")?;
-            timings.time("report", || self.write_report(findings, map, &manifest, progress.warnings()))?;
-        }
-        let archived = timings.time("archive", || self.finish_archive(&manifest, finished.as_mut(), progress))?;
-        manifest.recordings = timings.time("recording", || self.finish_recording(picture, progress))?;
-        if let Some(warning) = archived {
+        let findings = found.map(|(findings, _)| findings);
+        let last = self.finish_report_archive_recording(findings, shared.as_ref(), &manifest, picture, progress)?;
+        timings.merge(last.timings);
+        manifest.recordings = last.stretches;
+        if let Some(warning) = last.archive_note {
             progress.warn(warning)?;
         }
         live_frame::remove(&request.out_dir)?;
@@ -360,171 +310,99 @@ impl<'a> Products<'a> {
         self.request.products.contains(&group)
     }
 
-    fn write_report(
-        &self,
-        findings: &Findings,
-        map: &mut FinishedMap<'_>,
-        manifest: &Manifest,
-        warnings: &[String],
-    ) -> Result<()> {
-        let request = self.request;
-        let run = ReportRun {
-            asset: &request.asset,
-            source: &request.source_name,
-            recorded_at: request.recorded_at,
-            rig: &request.rig.name,
-            method: match request.recipe.method {
-                Method::Metric => "metric",
-                Method::Paper => "paper",
-            },
-            quality: &manifest.quality,
-            resolution: manifest.resolution.as_ref(),
-            warnings,
-        };
-        report::write(&run, findings, map, &request.out_dir)
-    }
-
-    /// Writes the maps, two things at a time: each squeezes or searches the whole map, on its own core. More at a time
-    /// would only need more memory.
-    fn write_maps(
+    /// Writes the archive, and beside it, on the other core, the report and the recording's end: they need the same map,
+    /// and nothing of each other.
+    fn finish_report_archive_recording(
         &mut self,
-        map: Option<&mut FinishedMap<'_>>,
-        sampling: Sampling,
+        findings: Option<Findings>,
+        map: Option<&SharedMap<'_, '_>>,
+        manifest: &Manifest,
+        picture: Option<Picture>,
         progress: &mut Progress<'_, '_>,
-    ) -> Result<Maps> {
-        let Some(map) = map else { return Ok(Maps::default()) };
-        let (folder, wanted) = (&self.request.out_dir, &self.request.products);
-        let wants = |group| wanted.contains(&group);
-        let text = self.preview_text();
-        let tiles = self.tiles.take();
-        let (options, chainage) = (&self.request.recipe.defects, self.request.chainage);
-        let shared = SharedMap::new(map);
-        std::thread::scope(|scope| {
-            let beside = scope.spawn(|| -> Result<Maps> {
-                let mut picture = None;
-                if wants(ProductGroup::Preview) || wants(ProductGroup::Recording) {
-                    let painted = preview::picture(&mut shared.reader(), &text)?;
-                    if wants(ProductGroup::Preview) {
-                        painted.save(&folder.join("preview.png"))?;
-                        painted.save_thumbnail(&folder.join("thumbnail.jpg"))?;
-                    }
-                    picture = Some(painted);
+    ) -> Result<Last> {
+        let (request, beside, frames) = (self.request, self.beside, self.frames);
+        let (archive, recorder) = (self.archive.take(), self.recorder.take());
+        let warnings = progress.warnings().to_vec();
+        let reported = findings.zip(map).filter(|_| self.wants(ProductGroup::Report));
+        for (stage, wanted) in
+            [("report", reported.is_some()), ("archive", archive.is_some()), ("recording", recorder.is_some())]
+        {
+            if wanted {
+                progress.step(stage)?;
+            }
+        }
+        let (last, segments) = std::thread::scope(|scope| {
+            let other = scope.spawn(|| {
+                let mut timings = Timings::default();
+                if let Some((findings, map)) = reported {
+                    let mut map = map.reader();
+                    timings.time("report", || write_report(request, &findings, &mut map, manifest, &warnings))?;
                 }
-                let found = match wants(ProductGroup::Defects) || wants(ProductGroup::Report) {
-                    true => find_defects(&mut shared.reader(), options, chainage, sampling, folder)?,
-                    false => None,
-                };
-                Ok(Maps { gray: None, picture, found })
+                let recorded = recorder.map(|r| timings.time("recording", || finish_recording(r, picture, &warnings)));
+                Ok::<_, Error>((timings, recorded.transpose()?.unwrap_or_default()))
             });
-            let mut gray = None;
-            if wants(ProductGroup::Depth) {
-                progress.step("depth")?;
-                depth_tif::write(&mut shared.reader(), &folder.join("depth.tif"))?;
-                gray = depth_png::write(&mut shared.reader(), folder)?;
-            }
-            if wants(ProductGroup::Texture) {
-                progress.step("texture")?;
-                texture::write(&mut shared.reader(), folder)?;
-            }
-            if let Some(tiles) = tiles {
-                progress.step("tiles")?;
-                tiles.finish(&mut shared.reader())?;
-            }
-            if wants(ProductGroup::Defects) || wants(ProductGroup::Report) {
-                progress.step("defects")?;
-            }
-            let maps = beside.join().map_err(|_| Error::internal("maps", "a thread panicked"))??;
-            Ok(Maps { gray, ..maps })
-        })
-    }
-
-    fn preview_text(&self) -> PreviewText {
-        PreviewText {
-            title: self.request.source_name.clone(),
-            start_chainage_mm: self.request.chainage.start_mm,
-            chainage_falls: self.request.chainage.falls,
-        }
-    }
-
-    fn finish_archive(
-        &mut self,
-        manifest: &Manifest,
-        map: Option<&mut FinishedMap<'_>>,
-        progress: &mut Progress<'_, '_>,
-    ) -> Result<Option<String>> {
-        let Some(archive) = self.archive.take() else { return Ok(None) };
-        progress.step("archive")?;
-        let job = ArchivedJob { request: self.request, beside: self.beside, frames: self.frames, manifest };
-        job.complete(archive, map, progress.warnings())
-    }
-
-    fn finish_recording(&mut self, picture: Option<Picture>, progress: &mut Progress<'_, '_>) -> Result<Vec<Stretch>> {
-        let Some(mut recorder) = self.recorder.take() else { return Ok(Vec::new()) };
-        progress.step("recording")?;
-        if let Some(picture) = picture {
-            recorder.log_map(picture.width_px() as u32, picture.height_px() as u32, picture.rgb())?;
-        }
-        for warning in progress.warnings().to_vec() {
-            recorder.log_warning(&warning)?;
-        }
-        let (segments, stretches) = recorder.finish()?;
+            let mut timings = Timings::default();
+            let archive_note = archive.map(|archive| {
+                let job = ArchivedJob { request, beside, frames, manifest };
+                let mut map = map.map(SharedMap::reader);
+                let map = map.as_mut().map(|map| map as &mut dyn MapReader);
+                timings.time("archive", || job.complete(archive, map, &warnings))
+            });
+            let other = other.join().map_err(|_| Error::internal("report", "a thread panicked"))?;
+            let (archive_note, (others, (segments, stretches))) = (archive_note.transpose()?.flatten(), other?);
+            timings.merge(others);
+            Ok::<_, Error>((Last { timings, archive_note, stretches }, segments))
+        })?;
         self.announcements(segments).into_iter().try_for_each(|event| progress.send(event))?;
-        Ok(stretches)
+        Ok(last)
     }
 }
 
-/// What writing the maps leaves.
-#[derive(Default)]
-struct Maps {
-    /// The gray values of `depth.png`.
-    gray: Option<GrayScale>,
-    /// The picture for people.
-    picture: Option<Picture>,
-    /// The defects, and how long it took to find them.
-    found: Option<(Findings, Duration)>,
+/// What the end of report, archive and recording leaves.
+struct Last {
+    timings: Timings,
+    /// What is to be known of the archive, in words.
+    archive_note: Option<String>,
+    stretches: Vec<Stretch>,
 }
 
-/// Depth map ▶ defects ▶ their files; `None` where too little was measured.
-fn find_defects(
+fn write_report(
+    request: &Request,
+    findings: &Findings,
     map: &mut dyn MapReader,
-    options: &DefectOptions,
-    chainage: Chainage,
-    sampling: Sampling,
-    folder: &Path,
-) -> Result<Option<(Findings, Duration)>> {
-    let start = Instant::now();
-    let mut residual = ResidualWriter::new(folder, residual_tif::NAME);
-    let found = defects::find(map, options, chainage, sampling, &mut |strip| residual.push(strip))?;
-    let Some(mut findings) = found else { return Ok(None) };
-    let codes = Codes::parse(&options.codes)
-        .map_err(|(found, expected)| Error::field("recipe", "defects.codes", found, expected))?;
-    for defect in &mut findings.list.defects {
-        defect.code = codes.of(defect.kind, &defect.severity).map(String::from);
+    manifest: &Manifest,
+    warnings: &[String],
+) -> Result<()> {
+    let run = ReportRun {
+        asset: &request.asset,
+        source: &request.source_name,
+        recorded_at: request.recorded_at,
+        rig: &request.rig.name,
+        method: match request.recipe.method {
+            Method::Metric => "metric",
+            Method::Paper => "paper",
+        },
+        quality: &manifest.quality,
+        resolution: manifest.resolution.as_ref(),
+        warnings,
+    };
+    report::write(&run, findings, map, &request.out_dir)
+}
+
+fn finish_recording(
+    mut recorder: Recordings,
+    picture: Option<Picture>,
+    warnings: &[String],
+) -> Result<(Vec<Segment>, Vec<Stretch>)> {
+    if let Some(picture) = picture {
+        recorder.log_map(picture.width_px() as u32, picture.height_px() as u32, picture.rgb())?;
     }
-    residual.finish()?;
-    defect_list::write(&findings.list, folder)?;
-    sections_csv::write(&findings.sections, folder)?;
-    Ok(Some((findings, start.elapsed())))
+    warnings.iter().try_for_each(|warning| recorder.log_warning(warning))?;
+    recorder.finish()
 }
 
 fn make<T>(wanted: bool, create: impl FnOnce() -> Result<T>) -> Result<Option<T>> {
     if wanted { create().map(Some) } else { Ok(None) }
-}
-
-/// World x, seen from the camera, of the laser line at distance `z_mm` on the optical axis' level.
-fn line_x_mm(rig: &Rig, z_mm: f64) -> f64 {
-    let plane = &rig.laser.plane;
-    let across = match rig.laser.line {
-        LineDirection::Vertical => plane.normal.x,
-        LineDirection::Horizontal => plane.normal.y,
-    };
-    (plane.offset_mm - plane.normal.z * z_mm) / across
-}
-
-/// The next of 1, 2 and 5 times a power of ten.
-fn round_up_125(value: f64) -> f64 {
-    let power = 10f64.powf(value.log10().floor());
-    [1.0, 2.0, 5.0, 10.0].into_iter().map(|step| step * power).find(|size| *size >= value).unwrap_or(10.0 * power)
 }
 
 fn surface_points(placed: &Placed<Cargo>) -> Vec<SurfacePoint> {
@@ -566,46 +444,4 @@ fn hash_source(info: &SourceInfo, request: &Request) -> Result<Vec<FileEntry>> {
         FileEntry::of(file, name)
     });
     files.iter().map(|file| FileEntry::of(file, name(file))).chain(poses).collect()
-}
-
-/// Says in words what the figures mean for a person.
-fn warn_of_quality(
-    quality: &Quality,
-    gaps: &[Gap],
-    request: &Request,
-    given: Option<TrackUse>,
-    progress: &mut Progress<'_, '_>,
-) -> Result<()> {
-    if quality.points == 0 && quality.spots > 0 {
-        return progress.warn(
-            "no point was measured: the laser line was found, but no ray to it meets the rig's laser plane in front of the \
-             camera; check that the rig is this run's, and the sign of its baseline"
-                .into(),
-        );
-    }
-    if quality.points == 0 {
-        let colour = format!("{:?}", request.rig.laser.colour).to_lowercase();
-        return progress.warn(format!(
-            "no point was measured: no {colour} laser line was found in any of the {} frames; check that the laser was on, \
-             and the rig's laser colour",
-            quality.frames
-        ));
-    }
-    let without = quality.frames - quality.frames_with_stripe;
-    if without > 0 {
-        progress.warn(format!("no laser line was found in {without} of {} frames", quality.frames))?;
-    }
-    if quality.frames == 1 {
-        return progress.warn("the run has a single frame: there is no motion, and the map is one column wide".into());
-    }
-    let lost = quality.frames - 1 - quality.frames_tracked;
-    // Of given poses that leave frames out, their reader has said so.
-    if lost > 0 && given != Some(TrackUse::Instead) {
-        let places = gaps.iter().filter(|g| g.reason == "not_tracked").count();
-        progress.warn(format!(
-            "the motion was lost in {lost} of {} frames, in {places} places: lengths along the travel are too short there",
-            quality.frames
-        ))?;
-    }
-    Ok(())
 }

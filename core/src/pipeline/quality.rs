@@ -1,6 +1,10 @@
 //! How well the run was measured: figures, gaps, and the paper's resolution for the run's own geometry.
 
+use super::Request;
+use super::progress::Progress;
+use crate::error::Result;
 use crate::export::manifest::{Gap, Quality, Resolution};
+use crate::motion::metric::Drift;
 use crate::motion::track::TrackUse;
 use crate::rig::Rig;
 use crate::stripe::Stripe;
@@ -78,6 +82,11 @@ impl QualityCounter {
         }
     }
 
+    /// Notes how far the poses may have drifted.
+    pub(super) fn note_drift(&mut self, drift: Option<Drift>) {
+        self.quality.drift = drift;
+    }
+
     /// The figures; `coverage` is the share of map pixels with a depth.
     pub(super) fn finish(self, rig: &Rig, coverage: f64) -> (Quality, Vec<Gap>, Option<Resolution>) {
         let mut quality = self.quality;
@@ -87,6 +96,48 @@ impl QualityCounter {
         let resolution = self.distance_mm.median().map(|z_mm| resolution(rig, z_mm, &quality));
         (quality, self.gaps, resolution)
     }
+}
+
+/// Says in words what the figures mean for a person.
+pub(super) fn warn_of_quality(
+    quality: &Quality,
+    gaps: &[Gap],
+    request: &Request,
+    given: Option<TrackUse>,
+    progress: &mut Progress<'_, '_>,
+) -> Result<()> {
+    if quality.points == 0 && quality.spots > 0 {
+        return progress.warn(
+            "no point was measured: the laser line was found, but no ray to it meets the rig's laser plane in front of the \
+             camera; check that the rig is this run's, and the sign of its baseline"
+                .into(),
+        );
+    }
+    if quality.points == 0 {
+        let colour = format!("{:?}", request.rig.laser.colour).to_lowercase();
+        return progress.warn(format!(
+            "no point was measured: no {colour} laser line was found in any of the {} frames; check that the laser was on, \
+             and the rig's laser colour",
+            quality.frames
+        ));
+    }
+    let without = quality.frames - quality.frames_with_stripe;
+    if without > 0 {
+        progress.warn(format!("no laser line was found in {without} of {} frames", quality.frames))?;
+    }
+    if quality.frames == 1 {
+        return progress.warn("the run has a single frame: there is no motion, and the map is one column wide".into());
+    }
+    let lost = quality.frames - 1 - quality.frames_tracked;
+    // Of given poses that leave frames out, their reader has said so.
+    if lost > 0 && given != Some(TrackUse::Instead) {
+        let places = gaps.iter().filter(|g| g.reason == "not_tracked").count();
+        progress.warn(format!(
+            "the motion was lost in {lost} of {} frames, in {places} places: lengths along the travel are too short there",
+            quality.frames
+        ))?;
+    }
+    Ok(())
 }
 
 /// Equations (15) to (18) at the run's own distance, speed and frame rate.
@@ -105,7 +156,8 @@ fn resolution(rig: &Rig, distance_mm: f64, quality: &Quality) -> Resolution {
     }
 }
 
-fn add_gap(gaps: &mut Vec<Gap>, frame: u32, reason: &str) {
+/// Adds a frame to a list of gaps.
+pub(super) fn add_gap(gaps: &mut Vec<Gap>, frame: u32, reason: &str) {
     let running = gaps.iter_mut().rev().find(|g| g.reason == reason).filter(|g| g.last_frame + 1 == frame);
     if let Some(gap) = running {
         gap.last_frame = frame;

@@ -5,6 +5,7 @@ use std::sync::Arc;
 
 use nalgebra::{Isometry3, Point3};
 
+use crate::geometry::WorldFromCamera;
 use crate::rig::{Camera, LineDirection, Rig};
 use crate::source::{Image, Yuv};
 use crate::stripe::Stripe;
@@ -17,6 +18,11 @@ const MAX_FRAMES: usize = 8;
 const STEP_PX: f64 = 6.0;
 /// Share of the line that must lie clear of the laser in an earlier frame.
 const CLEAR_SHARE: f64 = 0.8;
+/// Once a frame is chosen, its places may lie nearer to the laser: this share of the margin. Else just those would be left out
+/// whose spots are drawn aside by what the wall should tell.
+const CHOSEN_MARGIN: f32 = 0.8;
+/// Share that counts as all of it.
+const ALL_CLEAR_SHARE: f64 = 0.96;
 
 /// A frame that may show the wall without the laser.
 pub(super) struct Recent {
@@ -55,6 +61,46 @@ impl Recent {
             self.line_px.get(along.round().max(0.0) as usize).is_some_and(|line| (line - across).abs() < margin_px);
         (inside && !lit).then_some((across, along))
     }
+
+    /// Whether it shows all of a profile's places, or nearly, clear of the laser.
+    pub(super) fn shows_all(
+        &self,
+        rig: &Rig,
+        profile: &Profile,
+        world_from_camera: &WorldFromCamera,
+        margin_px: f32,
+    ) -> bool {
+        self.clear_share(rig, profile, world_from_camera, margin_px) >= ALL_CLEAR_SHARE
+    }
+
+    /// The share of a profile's places that it shows clear of the laser.
+    fn clear_share(&self, rig: &Rig, profile: &Profile, world_from_camera: &WorldFromCamera, margin_px: f32) -> f64 {
+        let step = (profile.points.len() / 24).max(1);
+        let (mut all, mut clear) = (0_u32, 0_u32);
+        for point in profile.points.iter().step_by(step) {
+            let world = world_from_camera * point.point_in_camera;
+            all += 1;
+            clear += u32::from(self.clear_place(&rig.camera, &world, margin_px).is_some());
+        }
+        f64::from(clear) / f64::from(all.max(1))
+    }
+
+    /// The wall of a profile as this frame shows it.
+    pub(super) fn wall_of(
+        &self,
+        rig: &Rig,
+        profile: &Profile,
+        world_from_camera: &WorldFromCamera,
+        positions: usize,
+        margin_px: f32,
+    ) -> Wall<'_> {
+        let mut places = vec![None; positions];
+        for point in &profile.points {
+            let world = world_from_camera * point.point_in_camera;
+            places[point.line_position as usize] = self.clear_place(&rig.camera, &world, CHOSEN_MARGIN * margin_px);
+        }
+        Wall { image: self.yuv(), places }
+    }
 }
 
 /// The last frames, the newest last.
@@ -87,7 +133,8 @@ impl RecentFrames {
         self.frames.clear();
     }
 
-    /// The newest frame that shows most of a profile's places clear of the laser, with these places.
+    /// The newest frame that shows all of a profile's places clear of the laser, or else the one that shows most, with these
+    /// places.
     pub(super) fn wall(
         &self,
         rig: &Rig,
@@ -97,19 +144,17 @@ impl RecentFrames {
         margin_px: f32,
     ) -> Option<(&Recent, Wall<'_>)> {
         let world_from_camera = camera_from_world.inverse();
-        let place =
-            |recent: &Recent, p: &Point3<f64>| recent.clear_place(&rig.camera, &(world_from_camera * p), margin_px);
-        let step = (profile.points.len() / 24).max(1);
-        let probes: Vec<&Point3<f64>> = profile.points.iter().step_by(step).map(|p| &p.point_in_camera).collect();
-        let clear = |recent: &&Recent| {
-            let clear = probes.iter().filter(|p| place(recent, p).is_some()).count();
-            !probes.is_empty() && clear as f64 >= CLEAR_SHARE * probes.len() as f64
-        };
-        let recent = self.frames.iter().rev().find(clear)?;
-        let mut places = vec![None; positions];
-        for point in &profile.points {
-            places[point.line_position as usize] = place(recent, &point.point_in_camera);
+        let mut best: Option<(f64, &Recent)> = None;
+        for recent in self.frames.iter().rev() {
+            let share = recent.clear_share(rig, profile, &world_from_camera, margin_px);
+            if share >= CLEAR_SHARE && best.is_none_or(|(most, _)| share > most) {
+                best = Some((share, recent));
+            }
+            if share >= ALL_CLEAR_SHARE {
+                break;
+            }
         }
-        Some((recent, Wall { image: recent.yuv(), places }))
+        let (_, recent) = best?;
+        Some((recent, recent.wall_of(rig, profile, &world_from_camera, positions, margin_px)))
     }
 }

@@ -1,5 +1,7 @@
 //! How the viewer lays the recording out, and the words that explain it.
 
+use std::sync::LazyLock;
+
 use rerun::blueprint::{
     Blueprint, BlueprintActivation, BlueprintPanel, ContainerLike, Horizontal, SelectionPanel, Spatial2DView,
     Spatial3DView, Tabs, TextDocumentView, TextLogView, TimePanel, TimeSeriesView, Vertical, components,
@@ -8,11 +10,13 @@ use rerun::datatypes::{Range2D, TimeRange, TimeRangeBoundary};
 use rerun::external::re_sdk_types::blueprint::archetypes::{TextLogColumns, VisibleTimeRanges, VisualBounds2D};
 use rerun::external::re_sdk_types::blueprint::datatypes::{TextLogColumn, TextLogColumnKind};
 use rerun::log::{Chunk, LogMsg};
-use rerun::{AsComponents, RecordingStreamBuilder, StoreId, TimePoint, Timeline};
+use rerun::{
+    AsComponents, RecordingStream, RecordingStreamBuilder, RecordingStreamResult, StoreId, TimePoint, Timeline,
+};
 
 use super::data::{FRAME, TIME, failed};
 use super::surface::DepthRange;
-use super::{charts, entity, images};
+use super::{APPLICATION, charts, entity, images};
 use crate::error::Result;
 use crate::rig::{LineDirection, Rig};
 
@@ -23,11 +27,33 @@ pub(super) fn opening(id: &StoreId, name: &str, recorded_at: jiff::Timestamp) ->
         .enabled(true)
         .recording_name(name)
         .recording_started(rerun::datatypes::TimeInt(started));
-    let (stream, storage) = builder.memory().map_err(failed)?;
+    let mut messages = said(builder, |_| Ok(())).map_err(failed)?;
+    messages.extend(LAYOUT.as_ref().map_err(failed)?.iter().cloned());
+    Ok(messages)
+}
+
+/// The layout as messages. One for all recordings of the process: the SDK keeps two threads for each that it makes.
+static LAYOUT: LazyLock<std::result::Result<Vec<LogMsg>, String>> = LazyLock::new(|| {
     let (layout, extras) = layout();
-    layout.send(&stream, BlueprintActivation { make_active: true, make_default: true }).map_err(failed)?;
-    let mut messages = storage.take();
-    add_to_blueprint(&mut messages, extras)?;
+    let activation = BlueprintActivation { make_active: true, make_default: true };
+    let messages =
+        said(RecordingStreamBuilder::new(APPLICATION).enabled(true), |stream| layout.send(stream, activation));
+    let mut messages = messages.map_err(|e| e.to_string())?;
+    messages.retain(|message| message.store_id().is_blueprint());
+    add_to_blueprint(&mut messages, extras).map_err(|e| e.to_string())?;
+    Ok(messages)
+});
+
+/// What a stream sends.
+fn said(
+    builder: RecordingStreamBuilder,
+    say: impl FnOnce(&RecordingStream) -> RecordingStreamResult<()>,
+) -> RecordingStreamResult<Vec<LogMsg>> {
+    let (stream, storage) = builder.memory()?;
+    say(&stream)?;
+    let messages = storage.take();
+    // The stream and its storage hold each other: without this its threads would run for as long as the process.
+    stream.disconnect();
     Ok(messages)
 }
 

@@ -23,6 +23,12 @@ const PROFILE_POINTS: usize = 400;
 const SPOT_COLOUR: [u8; 3] = [255, 40, 40];
 const CORNER_COLOUR: [u8; 3] = [64, 156, 255];
 
+/// Pixels of a frame, a side, that make one of the image that people are shown: at least 1.
+pub fn shrink(options: &RecordingOptions, rig: &Rig) -> usize {
+    let (full_width, full_height) = (rig.camera.width_px, rig.camera.height_px);
+    full_width.div_ceil(options.image_width_px.max(1)).min(full_height).max(1) as usize
+}
+
 /// Decides which frames are shown, and shows them.
 pub(super) struct Images {
     width_px: u32,
@@ -38,12 +44,11 @@ pub(super) struct Images {
 
 impl Images {
     pub(super) fn new(options: &RecordingOptions, rig: &Rig, duration_expected_s: Option<f64>) -> Images {
-        let (full_width, full_height) = (rig.camera.width_px, rig.camera.height_px);
-        let shrink = full_width.div_ceil(options.image_width_px.max(1)).min(full_height).max(1);
+        let shrink = shrink(options, rig);
         Images {
-            width_px: full_width / shrink,
-            height_px: full_height / shrink,
-            shrink: shrink as usize,
+            width_px: rig.camera.width_px / shrink as u32,
+            height_px: rig.camera.height_px / shrink as u32,
+            shrink,
             interval_s: 1.0 / options.images_per_s,
             duration_expected_s,
             last_s: None,
@@ -96,7 +101,8 @@ impl Images {
     pub(super) fn show(&mut self, steps: &FrameSteps<'_>, image: &Image, share: &mut Share) -> Result<Vec<Chunk>> {
         let at = steps.moment();
         self.last_s = Some(at.time_s);
-        let small = image.shrunk_bgr(self.shrink);
+        let is_shown_size = (image.width_px(), image.height_px()) == (self.width_px, self.height_px);
+        let small = image.shrunk_bgr(if is_shown_size { 1 } else { self.shrink });
         let mut jpegs = vec![(entity::IMAGE, self.jpeg(&small, FRAME_QUALITY)?)];
         if let Some(mask) = steps.effective_area {
             jpegs.push((entity::AREA, self.jpeg(&self.effective_area(small, image, mask)?, AREA_QUALITY)?));

@@ -14,8 +14,10 @@ use crate::error::{Error, Result};
 use crate::export::new_file::NewFile;
 
 /// Data of one entity waits for this much of it before it is written as one chunk: few large chunks load fast.
-const CHUNK_BYTES: u64 = 1 << 20;
+const CHUNK_BYTES: u64 = 384 << 10;
 const CHUNK_ROWS: usize = 4096;
+/// Chunks of one row are joined as soon as there are so many: each takes some kilobytes for a few bytes of data.
+const LOOSE_CHUNKS: usize = 32;
 /// A live segment is written before it grows past this, whatever its age.
 const SEGMENT_BYTES: u64 = 8 << 20;
 /// What one chunk costs on top of its data: schema, names, types.
@@ -45,8 +47,49 @@ pub(super) struct RrdStore {
 #[derive(Default)]
 struct Waiting {
     chunks: Vec<Chunk>,
-    bytes: u64,
+    /// The last of the chunks, that were never joined.
+    loose: usize,
     rows: usize,
+}
+
+impl Waiting {
+    fn push(&mut self, chunk: Chunk) {
+        self.rows += chunk.num_rows();
+        self.chunks.push(chunk);
+        self.loose += 1;
+        if self.loose >= LOOSE_CHUNKS {
+            let loose = self.chunks.split_off(self.chunks.len() - self.loose);
+            self.chunks.extend(joined(loose));
+            self.loose = 0;
+        }
+    }
+
+    fn is_full(&self) -> bool {
+        self.rows >= CHUNK_ROWS || self.chunks.iter().map(SizeBytes::total_size_bytes).sum::<u64>() >= CHUNK_BYTES
+    }
+}
+
+/// One chunk of them, or as few as their columns allow. Neighbours in pairs, then pairs of pairs: every byte is copied
+/// only a few times.
+fn joined(mut chunks: Vec<Chunk>) -> Vec<Chunk> {
+    loop {
+        let before = chunks.len();
+        let mut joined = Vec::with_capacity(before.div_ceil(2));
+        let mut rest = chunks.into_iter();
+        while let Some(left) = rest.next() {
+            match rest.next() {
+                None => joined.push(left),
+                Some(right) => match Chunk::concat_and_sort(&left, &right) {
+                    Ok(both) => joined.push(both),
+                    Err(_) => joined.extend([left, right]),
+                },
+            }
+        }
+        chunks = joined;
+        if chunks.len() <= 1 || chunks.len() == before {
+            return chunks;
+        }
+    }
 }
 
 impl RrdStore {
@@ -78,10 +121,8 @@ impl RrdStore {
             return self.write(&chunk);
         }
         let waiting = self.waiting.entry(chunk.entity_path().clone()).or_default();
-        waiting.bytes += chunk.total_size_bytes();
-        waiting.rows += chunk.num_rows();
-        waiting.chunks.push(chunk);
-        if waiting.bytes >= CHUNK_BYTES || waiting.rows >= CHUNK_ROWS {
+        waiting.push(chunk);
+        if waiting.is_full() {
             let full = std::mem::take(waiting);
             self.write_joined(full)?;
         }
@@ -99,29 +140,8 @@ impl RrdStore {
         }
     }
 
-    /// Writes chunks of one entity as one, or as few as their columns allow.
     fn write_joined(&mut self, waiting: Waiting) -> Result<()> {
-        let mut chunks = waiting.chunks;
-        // Neighbours in pairs, then pairs of pairs: every byte is copied only a few times.
-        loop {
-            let before = chunks.len();
-            let mut joined = Vec::with_capacity(before.div_ceil(2));
-            let mut rest = chunks.into_iter();
-            while let Some(left) = rest.next() {
-                match rest.next() {
-                    None => joined.push(left),
-                    Some(right) => match Chunk::concat_and_sort(&left, &right) {
-                        Ok(both) => joined.push(both),
-                        Err(_) => joined.extend([left, right]),
-                    },
-                }
-            }
-            chunks = joined;
-            if chunks.len() <= 1 || chunks.len() == before {
-                break;
-            }
-        }
-        chunks.iter().try_for_each(|chunk| self.write(chunk))
+        joined(waiting.chunks).iter().try_for_each(|chunk| self.write(chunk))
     }
 
     fn write(&mut self, chunk: &Chunk) -> Result<()> {

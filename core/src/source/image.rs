@@ -116,6 +116,12 @@ impl Image {
         bgr
     }
 
+    /// As [`Image::shrunk_bgr`], as an image of its own.
+    pub fn shrunk(&self, factor: usize) -> Image {
+        let factor = factor.max(1);
+        Image::from_bgr(self.width_px / factor as u32, self.height_px / factor as u32, self.shrunk_bgr(factor))
+    }
+
     /// Luma and chroma as the decoder gave them; made from the colours where the source gave those.
     pub fn yuv(&self) -> Yuv<'_> {
         match &self.given {

@@ -2,7 +2,7 @@
 //!
 //! ```text
 //! Yuv ▶ evidence (colour ridges, chroma only) ▶ choice ▶ spots (luma, plain) ▶ Seen
-//! Seen + the wall as it looks without the laser ▶ spots ▶ smoothing along the line ▶ Stripe with σ
+//! Seen + the wall as it looks without the laser ▶ the line's cross-section laid on ▶ smoothing along the line ▶ Stripe with σ
 //! ```
 //!
 //! The centre comes from the luma alone. Encoders halve the chroma and do not agree on where its samples lie: using
@@ -10,11 +10,12 @@
 //! its place is certain. It is turned into light first, the surroundings are taken off, and the centroid under a
 //! bell-shaped window finds the centre of a line whose core may be clipped: clipping is as symmetric as the line.
 //!
-//! What then remains is mostly the wall's own pattern under the line. Dividing by the same strip of wall as an
-//! earlier frame saw it, without the laser, takes most of that away ([`Wall`]); smoothing along the line, never across
-//! an edge, takes some of the rest.
+//! What then remains is mostly the wall's own pattern under the line. Dividing by the same strip of wall as
+//! another frame saw it, without the laser ([`Wall`]), and laying the line's own cross-section on what is left
+//! (`shape`) take most of that away; smoothing along the line, never across an edge, takes some of the rest.
 
 mod evidence;
+mod shape;
 mod smoothing;
 mod spot;
 
@@ -25,7 +26,8 @@ use crate::rig::{Laser, LineDirection};
 use crate::source::{PlaneView, Yuv};
 use crate::stripe::Stripe;
 use crate::stripe::choice::{self, Candidate};
-use spot::{Background, SpotShape};
+use shape::LineShape;
+use spot::SpotShape;
 
 /// Line positions that share one search for colour.
 const GROUP: usize = evidence::GROUP;
@@ -44,9 +46,10 @@ const COLOUR_SIGMA_PX: f32 = 2.0;
 const PIECE_MIN_GROUPS: usize = 2;
 /// Groups on each side that say where the line goes on.
 const LINE_REACH: usize = 10;
-/// A centre has settled when it moves less than this, px: before the wall's pattern is taken out, and after.
-const SETTLED_PLAIN_PX: f32 = 0.02;
-const SETTLED_PX: f32 = 0.005;
+/// What the wall's pattern, divided out, leaves of a spot's σ: it was most of the error (measured on simulated concrete).
+const DIVIDED_SIGMA: f32 = 0.6;
+/// A spot laid on the line's cross-section lies no further from its centroid than this, widths of the line.
+const LAID_ON_WIDTHS: f32 = 0.5;
 /// The line goes on from one row to the next where the row before lies this near to where the colour is, px.
 const GOES_ON_PX: f32 = 2.5;
 /// Two candidates closer than this are one, px.
@@ -65,7 +68,9 @@ pub struct StripeFinder {
 /// Measures what a [`StripeFinder`] has seen, in another thread.
 pub struct StripeMeasurer {
     options: SpotOptions,
+    shape: LineShape,
     pattern: Vec<f32>,
+    /// Each line position's light, divided by the pattern, as [`Seen::light`] lies.
     divided: Vec<f32>,
     spare: Sender<Vec<f32>>,
 }
@@ -80,7 +85,13 @@ pub fn stripe_stages(laser: &Laser, options: &SpotOptions) -> (StripeFinder, Str
         scratch: evidence::Scratch::default(),
         spare: take,
     };
-    let measurer = StripeMeasurer { options: options.clone(), pattern: Vec::new(), divided: Vec::new(), spare: give };
+    let measurer = StripeMeasurer {
+        options: options.clone(),
+        shape: LineShape::default(),
+        pattern: Vec::new(),
+        divided: Vec::new(),
+        spare: give,
+    };
     (finder, measurer)
 }
 
@@ -95,9 +106,9 @@ pub struct Seen {
     shape: SpotShape,
 }
 
-/// The wall without the laser: an earlier frame and where in it each spot's place on the wall lies.
+/// The wall without the laser: another frame and where in it each spot's place on the wall lies.
 pub struct Wall<'a> {
-    /// The earlier frame.
+    /// The other frame.
     pub image: Yuv<'a>,
     /// For each line position: (across, along) in that frame, px; `None` where the place is unknown, out of the image
     /// or lit by the laser in that frame too.
@@ -163,7 +174,7 @@ impl StripeFinder {
             seen.starts[position] = first;
             let profile = &mut seen.light[position * samples..][..samples];
             luma.read(position, first as usize, light, profile);
-            let spot = seen.shape.find(profile, Background::Sides, seen.shape.half as f32, SETTLED_PLAIN_PX);
+            let spot = seen.shape.find(profile, seen.shape.half as f32);
             // The brightest place may be a glint beside the line: it is not where the colour is.
             let largest_px = OFF_COLOUR_PX.max(OFF_COLOUR_WIDTHS * width_px);
             let spot = spot.filter(|spot| (first as f32 + spot.at - start.expected_px).abs() <= largest_px);
@@ -187,53 +198,73 @@ impl StripeFinder {
 impl StripeMeasurer {
     /// The stripe with all that is known: the wall without the laser where another frame saw it, and smoothed along the
     /// line.
-    pub fn measure(&mut self, seen: Seen, wall: Option<&Wall<'_>>) -> Stripe {
+    pub fn measure(&mut self, seen: &Seen, wall: Option<&Wall<'_>>) -> Stripe {
         let mut stripe = seen.stripe.clone();
         if let Some(wall) = wall.filter(|_| self.options.wall_reference) {
-            self.divide_by_wall(&seen, wall, &mut stripe);
+            self.divide_by_wall(seen, wall);
+            self.lay_on(seen, &mut stripe);
         }
         smoothing::smooth(&mut stripe, &self.options);
-        // The finder may have ended: then nobody needs it.
-        let _ = self.spare.send(seen.light);
         stripe
     }
 
-    /// Measures each spot again on the light divided by the wall's own pattern.
-    fn divide_by_wall(&mut self, seen: &Seen, wall: &Wall<'_>, stripe: &mut Stripe) {
-        let luma = Lines::of(wall.image, stripe.line);
+    /// Gives the memory of what was measured back to the finder.
+    pub fn done_with(&mut self, seen: Seen) {
+        // The finder may have ended: then nobody needs it.
+        let _ = self.spare.send(seen.light);
+    }
+
+    /// Each spot's light divided by the wall's own pattern; NaN where that is not known.
+    fn divide_by_wall(&mut self, seen: &Seen, wall: &Wall<'_>) {
+        let luma = Lines::of(wall.image, seen.stripe.line);
         let table = wall.image.light();
         let samples = seen.samples();
-        let positions = seen.starts.len();
         let pattern = &mut self.pattern;
-        pattern.resize(positions * samples, f32::NAN);
+        pattern.resize(seen.light.len(), f32::NAN);
         for (position, out) in pattern.chunks_exact_mut(samples).enumerate() {
-            let (Some(Some((across, along))), true) =
-                (wall.places.get(position), stripe.across_px[position].is_finite())
-            else {
+            let at = seen.stripe.across_px[position];
+            let (Some(Some((across, along))), true) = (wall.places.get(position), at.is_finite()) else {
                 out[0] = f32::NAN;
                 continue;
             };
-            let offset = seen.starts[position] as f32 - stripe.across_px[position];
-            luma.read_between(*along, across + offset, table, out);
+            luma.read_between(*along, across + seen.starts[position] as f32 - at, table, out);
         }
         let trust = spot::soften(pattern, samples);
-        self.divided.resize(samples, 0.0);
-        for position in 0..positions {
-            let pattern = &pattern[position * samples..][..samples];
-            if !stripe.across_px[position].is_finite() || !pattern[0].is_finite() {
-                continue;
+        self.divided.resize(seen.light.len(), 0.0);
+        let rows = self.divided.chunks_exact_mut(samples).zip(pattern.chunks_exact(samples));
+        for (position, (out, pattern)) in rows.enumerate() {
+            let known = pattern[0].is_finite();
+            if !(known && seen.shape.divide(seen.profile(position), pattern, trust, out)) {
+                out[0] = f32::NAN;
             }
-            let start = stripe.across_px[position] - seen.starts[position] as f32;
-            if !seen.shape.divide(seen.profile(position), pattern, trust, &mut self.divided) {
-                continue;
+        }
+    }
+
+    /// Lays the line's own cross-section on each spot whose light was divided, and learns it from them. The flanks of others
+    /// show the pattern more than their centroids do.
+    fn lay_on(&mut self, seen: &Seen, stripe: &mut Stripe) {
+        self.shape.expect(seen.shape.width_px);
+        let largest_px = LAID_ON_WIDTHS * seen.shape.width_px;
+        // The first frame teaches by its centroids.
+        for _ in 0..if self.shape.is_known() { 1 } else { 2 } {
+            for (position, profile) in self.divided.chunks_exact(seen.samples()).enumerate() {
+                if !profile[0].is_finite() {
+                    continue;
+                }
+                let first = seen.starts[position] as f32;
+                let start = seen.stripe.across_px[position] - first;
+                let laid = self.shape.lay_on(profile, start).filter(|spot| (spot.at - start).abs() < largest_px);
+                if let Some(spot) = laid {
+                    stripe.across_px[position] = first + spot.at;
+                    // Light of another form is not the line's alone: beside a highlight it is drawn aside.
+                    stripe.sigma_px[position] = DIVIDED_SIGMA * seen.stripe.sigma_px[position] * spot.misfit.max(1.0);
+                }
+                if self.shape.teaches(position) {
+                    let taught = if self.shape.is_known() { laid } else { self.shape.rough(profile, start) };
+                    taught.into_iter().for_each(|spot| self.shape.take_in(profile, spot));
+                }
             }
-            if let Some(spot) = seen.shape.find(&self.divided, Background::None, start, SETTLED_PX)
-                && (spot.at - start).abs() < 0.5 * seen.shape.width_px
-            {
-                stripe.across_px[position] = seen.starts[position] as f32 + spot.at;
-                // The pattern was most of the error: half of it is gone (measured on simulated concrete).
-                stripe.sigma_px[position] *= 0.6;
-            }
+            self.shape.learn();
         }
     }
 }

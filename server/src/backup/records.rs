@@ -15,8 +15,8 @@ use serde::de::DeserializeOwned;
 
 use crate::db::Db;
 use crate::db::tables::{
-    asset, audit, batch, batch_run, defect, idempotency_key, inspection, job, log_line, pin, product, rig, run,
-    segment, source_segment, token, unpublished,
+    asset, audit, batch, batch_run, defect, idempotency_key, inspection, job, log_line, pin, product, retention_rules,
+    rig, run, segment, source_segment, token, unpublished,
 };
 use crate::error::{Error, Result};
 use crate::store::Key;
@@ -31,7 +31,7 @@ const ROWS_AT_ONCE: usize = 200;
 macro_rules! each_table {
     ($do:ident($($argument:expr),*) into $rows:ident) => {
         each_table!(@ $do($($argument),*) $rows: rig asset run source_segment pin batch batch_run job product segment log_line
-            defect inspection idempotency_key unpublished token audit)
+            defect inspection retention_rules idempotency_key unpublished token audit)
     };
     (@ $do:ident $arguments:tt $rows:ident: $($table:ident)*) => {
         $(each_table!(one $do $arguments $rows $table);)*

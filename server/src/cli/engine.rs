@@ -166,6 +166,11 @@ impl Engine {
         Ok(Engine { db, queue, store, disk, limits: limits.clone(), places: places.clone(), _lock: lock })
     }
 
+    /// Hears of other processes' changes, and tells them of ours, until asked to stop.
+    pub(super) fn relay(&self, stop: &CancellationToken) -> tokio::task::JoinHandle<()> {
+        tokio::spawn(self.queue.bell().clone().relay(self.db.clone(), stop.clone()))
+    }
+
     /// The worker of this process.
     pub(super) async fn worker(&self, stop: &CancellationToken) -> Result<Worker> {
         let program = std::env::current_exe().map_err(|e| Error::io("the path of this program", e))?;

@@ -3,18 +3,20 @@
 mod remote;
 
 use std::io::Write;
+use std::ops::RangeInclusive;
 use std::path::{Path, PathBuf};
 
 use clap::{Args, ValueEnum};
 use reqwest::Url;
 use stria_core::export::archive_mcap::{ArchiveCut, cut};
 use stria_core::export::cloud_laz::CloudLazWriter;
-use stria_core::export::cloud_ply::CloudPlyReader;
+use stria_core::export::cloud_ply::{CloudPlyReader, CloudPlyWriter};
 use stria_core::export::depth_tif::section::Cut;
 use stria_core::export::manifest::FILE_NAME;
 use stria_core::export::mesh_glb;
 use stria_core::export::new_file::NewFile;
 use stria_core::export::{cloud_e57, cloud_pcd, section_csv};
+use stria_core::surface::SurfacePoint;
 
 use self::remote::RemoteJob;
 use super::progress::size;
@@ -26,7 +28,7 @@ use crate::wire::Direction;
 enum Format {
     /// The archive, whole or in part: frames, poses, profiles, surface, map; opens in Foxglove and rerun
     Mcap,
-    /// The cloud as the job wrote it, mm
+    /// The cloud, mm: as the job wrote it, or a part of it
     Ply,
     /// The cloud as LAZ 1.4, metres, with confidence and frame as extra dimensions
     Laz,
@@ -47,7 +49,7 @@ enum Format {
 /// Export a job's products as a file that other programs open
 #[derive(Args)]
 #[command(
-    after_help = "Examples: stria export products --format laz --out wall.laz\n          stria export products --format csv --at-mm 1200\n          stria export 0198c… --server http://127.0.0.1:8420 --format mcap --without-frames"
+    after_help = "Examples: stria export products --format laz --out wall.laz\n          stria export products --format e57 --from-mm 5000 --to-mm 10000 --every 4\n          stria export products --format csv --at-mm 1200\n          stria export 0198c… --server http://127.0.0.1:8420 --format mcap --without-frames"
 )]
 pub(super) struct Export {
     /// A product folder, or the id of a job on a server
@@ -71,13 +73,14 @@ pub(super) struct Export {
     /// mcap: leave the camera's frames out
     #[arg(long)]
     without_frames: bool,
-    /// mcap: only every n-th frame with what was measured in it, and every n-th point of the surface
+    /// mcap: only every n-th frame with what was measured in it, and every n-th point of the surface; clouds: only every n-th
+    /// point
     #[arg(long, value_name = "N", value_parser = clap::value_parser!(u32).range(1..))]
     every: Option<u32>,
-    /// mcap: only the wall from this chainage on, mm
+    /// mcap, clouds, glb: only the wall from this chainage on, mm
     #[arg(long, value_name = "MM", allow_negative_numbers = true)]
     from_mm: Option<f64>,
-    /// mcap: only the wall up to this chainage, mm
+    /// mcap, clouds, glb: only the wall up to this chainage, mm
     #[arg(long, value_name = "MM", allow_negative_numbers = true)]
     to_mm: Option<f64>,
     /// csv: across the wall at this chainage, mm
@@ -138,7 +141,7 @@ impl Export {
         let job = RemoteJob::find(&self.server, &self.from)?;
         let chainage = Chainage { start_mm: job.chainage_mm, direction: job.direction };
         let out = self.out();
-        if self.format == Format::Mcap && !self.whole_archive() {
+        if self.format == Format::Mcap && !self.whole() {
             // The server makes the part while it sends it.
             job.download(&self.archive_path(), &out)?;
             return done(&out, "a part of the archive");
@@ -146,7 +149,7 @@ impl Export {
         let scratch =
             tempfile::tempdir_in(parent(&out)).map_err(|e| Failed::Input(format!("{}: {e}", out.display())))?;
         job.fetch(self.needed(), scratch.path())?;
-        if self.format == Format::Laz && !scratch.path().join("cloud.laz").exists() {
+        if self.format == Format::Laz && self.whole() && !scratch.path().join("cloud.laz").exists() {
             job.fetch(&["cloud.ply"], scratch.path())?;
         }
         self.export(scratch.path(), chainage)
@@ -154,17 +157,21 @@ impl Export {
 
     /// An option of another format would be without effect: the person meant something else.
     fn check_options(&self) -> Result<(), Failed> {
+        use Format::{Csv, E57, Glb, Laz, Mcap, Pcd, Ply};
+        let (parts, stretches) = ([Mcap, Ply, Laz, Pcd, E57], [Mcap, Ply, Laz, Pcd, E57, Glb]);
         let options = [
-            ("--without-frames", self.without_frames, Format::Mcap),
-            ("--every", self.every.is_some(), Format::Mcap),
-            ("--from-mm", self.from_mm.is_some(), Format::Mcap),
-            ("--to-mm", self.to_mm.is_some(), Format::Mcap),
-            ("--at-mm", self.at_mm.is_some(), Format::Csv),
-            ("--line", self.line.is_some(), Format::Csv),
+            ("--without-frames", self.without_frames, &[Mcap][..]),
+            ("--every", self.every.is_some(), &parts),
+            ("--from-mm", self.from_mm.is_some(), &stretches),
+            ("--to-mm", self.to_mm.is_some(), &stretches),
+            ("--at-mm", self.at_mm.is_some(), &[Csv]),
+            ("--line", self.line.is_some(), &[Csv]),
         ];
-        if let Some((name, _, format)) = options.iter().find(|(_, given, format)| *given && *format != self.format) {
-            let (format, mine) = (format_name(*format), format_name(self.format));
-            return Err(Failed::Input(format!("{name} is for --format {format}, not {mine}")));
+        if let Some((name, _, formats)) =
+            options.iter().find(|(_, given, formats)| *given && !formats.contains(&self.format))
+        {
+            let (of, mine) = (formats.iter().map(|f| format_name(*f)).collect::<Vec<_>>(), format_name(self.format));
+            return Err(Failed::Input(format!("{name} is for --format {}, not {mine}", of.join(", "))));
         }
         if self.format == Format::Csv && self.at_mm.is_none() && self.line.is_none() {
             return Err(Failed::Input("--format csv: no line given; expected --at-mm or --line".into()));
@@ -177,7 +184,8 @@ impl Export {
         Ok(())
     }
 
-    fn whole_archive(&self) -> bool {
+    /// Everything that the job wrote is wanted.
+    fn whole(&self) -> bool {
         !self.without_frames && self.every.is_none() && self.from_mm.is_none() && self.to_mm.is_none()
     }
 
@@ -193,8 +201,8 @@ impl Export {
     fn needed(&self) -> &'static [&'static str] {
         match self.format {
             Format::Mcap => &["archive.mcap"],
-            Format::Laz => &["cloud.laz"],
-            Format::Ply | Format::Pcd | Format::E57 => &["cloud.ply"],
+            Format::Laz if self.whole() => &["cloud.laz"],
+            Format::Ply | Format::Laz | Format::Pcd | Format::E57 => &["cloud.ply"],
             Format::Glb => &["depth.tif", "tiles/tiles.json", "tiles/texture/"],
             Format::Csv | Format::Tiff => &["depth.tif"],
             Format::Rrd => &["recording.rrd"],
@@ -224,18 +232,19 @@ impl Export {
         };
         let out = self.out();
         match self.format {
-            Format::Ply => copy(&product("cloud.ply")?, &out),
+            Format::Ply if self.whole() => copy(&product("cloud.ply")?, &out),
             Format::Tiff => copy(&product("depth.tif")?, &out),
             Format::Rrd => copy(&product("recording.rrd")?, &out),
-            Format::Mcap if self.whole_archive() => copy(&product("archive.mcap")?, &out),
+            Format::Mcap if self.whole() => copy(&product("archive.mcap")?, &out),
             Format::Mcap => self.archive(&product("archive.mcap")?, &out, chainage),
             // Jobs of before made none.
-            Format::Laz if folder.join("cloud.laz").exists() => copy(&folder.join("cloud.laz"), &out),
-            Format::Laz | Format::Pcd | Format::E57 => self.cloud(&product("cloud.ply")?, &out),
+            Format::Laz if self.whole() && folder.join("cloud.laz").exists() => copy(&folder.join("cloud.laz"), &out),
+            Format::Ply | Format::Laz | Format::Pcd | Format::E57 => self.cloud(&product("cloud.ply")?, &out, chainage),
             Format::Csv => self.section(&product("depth.tif")?, &out, chainage),
             Format::Glb => {
                 product("depth.tif")?;
-                let mesh = mesh_glb::write(&out, folder, self.max_vertices)?;
+                let stretch_mm = self.stretch_mm(chainage).unwrap_or(mesh_glb::ALL_MM);
+                let mesh = mesh_glb::write(&out, folder, self.max_vertices, &stretch_mm)?;
                 let picture = if mesh.textured { "with the wall's picture" } else { "without a picture: no tiles" };
                 let (v, t, mm) = (mesh.vertices, mesh.triangles, mesh.mm_per_vertex);
                 done(&out, &format!("{v} vertices every {mm:.3} mm, {t} triangles, {picture}"))
@@ -243,14 +252,18 @@ impl Export {
         }
     }
 
-    fn archive(&self, archive: &Path, out: &Path, chainage: Chainage) -> Outcome {
-        let some = self.from_mm.is_some() || self.to_mm.is_some();
+    /// The stretch that is wanted, in the run's own x; `None` for all of it.
+    fn stretch_mm(&self, chainage: Chainage) -> Option<RangeInclusive<f64>> {
         let ends = [self.from_mm.unwrap_or(f64::NEG_INFINITY), self.to_mm.unwrap_or(f64::INFINITY)];
         let [a, b] = ends.map(|mm| chainage.x_mm(mm));
+        (self.from_mm.is_some() || self.to_mm.is_some()).then(|| a.min(b)..=a.max(b))
+    }
+
+    fn archive(&self, archive: &Path, out: &Path, chainage: Chainage) -> Outcome {
         let how = ArchiveCut {
             frames: !self.without_frames,
             every: self.every.unwrap_or(1),
-            x_mm: some.then(|| a.min(b)..=a.max(b)),
+            x_mm: self.stretch_mm(chainage),
         };
         let mut file = NewFile::create(out)?;
         cut(archive, &how, &mut file, &out.display().to_string())?;
@@ -258,21 +271,43 @@ impl Export {
         done(out, "a part of the archive")
     }
 
-    fn cloud(&self, cloud: &Path, out: &Path) -> Outcome {
-        let points = CloudPlyReader::open(cloud)?;
-        let count = points.points();
+    fn cloud(&self, cloud: &Path, out: &Path, chainage: Chainage) -> Outcome {
+        let all = CloudPlyReader::open(cloud)?.points();
+        // Some formats say it in their head.
+        let count = if self.whole() { all } else { self.points(cloud, chainage)?.count() as u64 };
+        if count == 0 && all > 0 {
+            return Err(Failed::Input(format!("{}: no point there; expected a stretch of the cloud", cloud.display())));
+        }
+        let mut points = self.points(cloud, chainage)?;
         match self.format {
             Format::Pcd => cloud_pcd::write(out, count, points)?,
             Format::E57 => cloud_e57::write(out, &self.from, count, points)?,
+            Format::Ply => {
+                let mut writer = CloudPlyWriter::create(out)?;
+                points.try_for_each(|point| writer.push(&point?))?;
+                writer.finish()?;
+            }
             _ => {
                 let mut writer = CloudLazWriter::create(out)?;
-                for point in points {
-                    writer.push(&point?)?;
-                }
+                points.try_for_each(|point| writer.push(&point?))?;
                 writer.finish()?;
             }
         }
-        done(out, &format!("{count} points"))
+        done(out, &if count == all { format!("{count} points") } else { format!("{count} of {all} points") })
+    }
+
+    /// The points that are wanted, and what cannot be read.
+    fn points(
+        &self,
+        cloud: &Path,
+        chainage: Chainage,
+    ) -> Result<impl Iterator<Item = stria_core::Result<SurfacePoint>> + use<>, Failed> {
+        let (stretch_mm, every) = (self.stretch_mm(chainage), self.every.unwrap_or(1) as usize);
+        let there = move |point: &stria_core::Result<SurfacePoint>| match (point, &stretch_mm) {
+            (Ok(point), Some(stretch_mm)) => stretch_mm.contains(&point.point_in_world.x),
+            _ => true,
+        };
+        Ok(CloudPlyReader::open(cloud)?.filter(there).step_by(every))
     }
 
     fn section(&self, map: &Path, out: &Path, chainage: Chainage) -> Outcome {

@@ -96,6 +96,10 @@ fn products(path: &Path) -> Result<(&'static str, Facts, Value), Failed> {
         ("travel", format!("{:.1} mm in {:.1} s", q.travel_mm, q.duration_s)),
         ("points", q.points.to_string()),
     ];
+    facts.extend(q.drift.map(|d| {
+        let axes = format!("±{:.1} mm along, ±{:.1} mm across, ±{:.1} mm deep at the end", d.x_mm, d.y_mm, d.z_mm);
+        ("drift", axes)
+    }));
     if let Some(map) = &manifest.depth_map {
         facts.push((
             "map",

@@ -21,7 +21,7 @@ use crate::defects::Defects;
 use crate::error::Error;
 use crate::http::{self, App, Changes, Rates};
 use crate::live::Live;
-use crate::retention::Policy;
+use crate::retention::{MOST_DAYS, MOST_GB, Policy};
 use crate::runs::Runs;
 use crate::uploads::Uploads;
 use crate::{incoming, live, retention};
@@ -62,7 +62,8 @@ pub(super) struct Serve {
     upload_kept_h: f64,
     #[command(flatten)]
     jobs: JobArgs,
-    /// Delete runs that came in more than so many days ago, unless they are pinned; GET /api/retention says which
+    /// Delete runs that came in more than so many days ago, unless they are pinned; GET /api/retention says which. Holds,
+    /// as --quota-gb does, until somebody stores other rules in the browser's settings or by PUT /api/retention
     #[arg(long, value_name = "D", env = "STRIA_KEEP_DAYS")]
     keep_days: Option<f64>,
     /// Delete the oldest runs while sources and products take more than this, unless they are pinned
@@ -114,8 +115,8 @@ impl Serve {
                 self.listen
             )));
         }
-        let keep_days = self.keep_days.map(|d| positive("--keep-days", d, 1e6, "days")).transpose()?;
-        let quota_gb = self.quota_gb.map(|gb| positive("--quota-gb", gb, 1e9, "GB")).transpose()?;
+        let keep_days = self.keep_days.map(|d| positive("--keep-days", d, MOST_DAYS, "days")).transpose()?;
+        let quota_gb = self.quota_gb.map(|gb| positive("--quota-gb", gb, MOST_GB, "GB")).transpose()?;
         let upload_bytes = (positive("--max-upload-gb", self.max_upload_gb, 1e6, "GB")? * GB as f64) as u64;
         let come_back = Duration::from_secs_f64(positive("--live-come-back-s", self.live_come_back_s, 1e6, "s")?);
         let sender_silence = positive("--sender-silence-s", self.sender_silence_s, 86_400.0, "s")?;
@@ -169,6 +170,7 @@ async fn serve(config: Config) -> std::result::Result<(), Failed> {
     let engine =
         Engine::start(&config.places, &config.jobs, config.requests.disk_reserve_bytes).await.map_err(failed)?;
     incoming::remove_leftovers(&config.places.incoming()).map_err(failed)?;
+    Changes::prepare(&config.places.changes()).map_err(failed)?;
     let worker = engine.worker(&stop).await.map_err(failed)?;
     let (db, queue, store) = (engine.db.clone(), engine.queue.clone(), engine.store.clone());
     let runs = Runs::new(db.clone(), queue.clone(), store.clone());
@@ -195,6 +197,7 @@ async fn serve(config: Config) -> std::result::Result<(), Failed> {
         stop: stop.clone(),
     };
 
+    let relay = engine.relay(&stop);
     let work = tokio::spawn(worker.run(config.workers));
     let sweep = tokio::spawn(retention::run(
         db.clone(),
@@ -233,6 +236,7 @@ async fn serve(config: Config) -> std::result::Result<(), Failed> {
         // What arrived of an upload whose connection died is still being kept.
         uploads.tasks().close();
         let _ = tokio::time::timeout(config.requests.stop_grace, uploads.tasks().wait()).await;
+        let _ = relay.await;
         let _ = sweep.await;
         let _ = watch.await;
         let _ = step.await;

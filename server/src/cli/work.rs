@@ -96,6 +96,7 @@ async fn work(
         None => None,
     };
     let _ = std::io::stdout().flush();
+    let relay = engine.relay(&stop);
     let mut work = tokio::spawn(worker.run(slots));
     let ended = tokio::select! {
         ended = &mut work => ended,
@@ -115,6 +116,8 @@ async fn work(
     if let Some(answer) = answer {
         let _ = answer.await;
     }
+    stop.cancel();
+    let _ = relay.await;
     engine.db.close().await.map_err(failed)
 }
 

@@ -514,6 +514,29 @@ pub mod pin {
     impl ActiveModelBehavior for ActiveModel {}
 }
 
+/// Rules of keeping that people stored: one row.
+pub mod retention_rules {
+    use sea_orm::entity::prelude::*;
+
+    #[derive(Clone, Debug, PartialEq, DeriveEntityModel, serde::Serialize, serde::Deserialize)]
+    #[sea_orm(table_name = "retention_rules")]
+    pub struct Model {
+        #[sea_orm(primary_key, auto_increment = false)]
+        pub id: i32,
+        pub keep_days: Option<f64>,
+        pub quota_gb: Option<f64>,
+        pub stored: i32,
+        pub version: i64,
+        pub changed_ms: i64,
+        pub changed_by: String,
+    }
+
+    #[derive(Copy, Clone, Debug, EnumIter, DeriveRelation)]
+    pub enum Relation {}
+
+    impl ActiveModelBehavior for ActiveModel {}
+}
+
 /// Defects of jobs that are done.
 pub mod defect {
     use sea_orm::entity::prelude::*;

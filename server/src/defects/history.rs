@@ -17,7 +17,7 @@ const NEIGHBOURS_MM: f64 = 2000.0;
 const MOST_NEIGHBOURS: u64 = 200;
 
 impl Defects {
-    /// What every run of the same asset and direction that passed its place says of it, the latest first. Where runs lie
+    /// What every run of the same asset that passed its place, either way, says of it, the latest first. Where runs lie
     /// shifted to each other by up to `slack_mm`, the defects around it tell by how much.
     pub async fn history(&self, id: &str, slack_mm: f64) -> Result<wire::DefectHistory> {
         let own = self.row(id).await?;
@@ -28,7 +28,7 @@ impl Defects {
         let direction = runs.iter().find(|r| r.id == own.run_id).map(|r| r.direction.clone());
         let around = self.around(&own.run_id, Some(&own.job_id), own.chainage_mm, NEIGHBOURS_MM).await?;
         let mut items = Vec::new();
-        for run in runs.into_iter().filter(|r| Some(&r.direction) == direction.as_ref()) {
+        for run in runs {
             let job = if run.id == own.run_id { Some(own.job_id.as_str()) } else { None };
             let there = self.around(&run.id, job, own.chainage_mm, NEIGHBOURS_MM + slack_mm).await?;
             let shown = match job {
@@ -43,7 +43,9 @@ impl Defects {
             if x_mm < seen.x_min_mm - slack || x_mm > seen.x_max_mm + slack {
                 continue;
             }
-            let same = partners(&places(&around), &places(&there), slack);
+            // A camera that sees the same surface on the way back is turned half about its axis.
+            let turned = direction.as_ref().is_some_and(|own| *own != run.direction);
+            let same = partners(&places(&around, false), &places(&there, turned), slack);
             let at = around.iter().position(|d| d.id == own.id).and_then(|i| same[i]);
             items.push(wire::DefectSighting {
                 run: run.id,
@@ -93,9 +95,11 @@ fn x_of(run: &run::Model, chainage_mm: f64) -> f64 {
     if run.direction == Direction::Backward.as_str() { -way_mm } else { way_mm }
 }
 
-fn places(rows: &[defect::Model]) -> Vec<Place<'_>> {
+/// Places along and across the asset; of a run that went the other way `turned`.
+fn places(rows: &[defect::Model], turned: bool) -> Vec<Place<'_>> {
     let of = |d: &defect::Model| 0.5 * (d.length_mm + d.width_mm);
     // A dent may have become a hole since.
     let side = |d: &defect::Model| if d.depth_mm > 0.0 { "away" } else { "towards" };
-    rows.iter().map(|d| Place { kind: side(d), x_mm: d.chainage_mm, y_mm: d.y_mm, extent_mm: of(d) }).collect()
+    let across_mm = |d: &defect::Model| if turned { -d.y_mm } else { d.y_mm };
+    rows.iter().map(|d| Place { kind: side(d), x_mm: d.chainage_mm, y_mm: across_mm(d), extent_mm: of(d) }).collect()
 }

@@ -6,19 +6,21 @@ use std::path::Path as FilePath;
 use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
 use std::time::Duration;
 
+use axum::body::Body;
 use axum::extract::State;
 use axum::http::StatusCode;
-use axum::http::header::RETRY_AFTER;
+use axum::http::header::{CONTENT_DISPOSITION, CONTENT_TYPE, RETRY_AFTER};
 use axum::response::{IntoResponse, Response};
 use serde::Deserialize;
 use stria_core::defects::{DefectList, change};
-use stria_core::export::change_list::state_name;
+use stria_core::export::change_list::{MAP_NAME, state_name};
 use stria_core::export::defect_list;
-use stria_core::export::residual_tif::{self, ResidualFile};
+use stria_core::export::residual_tif::{self, ResidualFile, ResidualWriter};
 use stria_core::recipe::{DefectOptions, Recipe};
+use tempfile::TempDir;
 use tokio::io::AsyncReadExt;
 use tokio::sync::{Semaphore, watch};
-use tokio_util::io::StreamReader;
+use tokio_util::io::{ReaderStream, StreamReader};
 use utoipa::IntoParams;
 
 use super::App;
@@ -31,8 +33,8 @@ use crate::wire::{self, ChangeReport, Direction, Problem};
 const AT_ONCE: usize = 1;
 /// Comparisons that may wait for that.
 const MOST_WAITING: usize = 16;
-/// Results that are kept.
-const MOST_KEPT: usize = 64;
+/// Results that are kept, each with its map on the disk.
+const MOST_KEPT: usize = 24;
 /// A request waits so long for a result, then asks its sender to come back.
 const WAIT: Duration = Duration::from_secs(10);
 /// When to come back, s.
@@ -40,9 +42,15 @@ const COME_BACK_S: u64 = 2;
 /// A list of defects larger than this is not compared, bytes.
 const MAX_LIST_BYTES: u64 = 64 * 1024 * 1024;
 
-type Outcome = Option<std::result::Result<Arc<ChangeReport>, Refusal>>;
+type Outcome = Option<std::result::Result<Arc<Worked>, Refusal>>;
 /// The earlier job and the later one, each with where its run lies.
 type Pair = (String, String);
+
+/// A comparison: what is told of it, and the difference map in a folder of its own, which goes when this does.
+struct Worked {
+    report: ChangeReport,
+    difference: Option<TempDir>,
+}
 
 /// Why two jobs cannot be compared, to be said to everyone who asks.
 #[derive(Clone)]
@@ -130,7 +138,15 @@ impl Changes {
         Ok(receiver)
     }
 
-    async fn work_out(&self, app: &App, task: Task) -> Result<ChangeReport> {
+    /// Makes the folder for the maps anew: what a server that was killed left there belongs to nobody.
+    pub(crate) fn prepare(folder: &std::path::Path) -> Result<()> {
+        match std::fs::remove_dir_all(folder) {
+            Err(e) if e.kind() != std::io::ErrorKind::NotFound => Err(Error::io(folder, e)),
+            _ => std::fs::create_dir_all(folder).map_err(|e| Error::io(folder, e)),
+        }
+    }
+
+    async fn work_out(&self, app: &App, task: Task) -> Result<Worked> {
         let _turn = self.turns.acquire().await.map_err(|e| Error::Internal(e.to_string()))?;
         let read = (list(app, &task.before).await?, list(app, &task.after).await?);
         let residual = |job: String| {
@@ -141,17 +157,23 @@ impl Changes {
             }
         };
         let files = (residual(task.before.job.clone()).await?, residual(task.after.job.clone()).await?);
-        let stop = app.stop.clone();
+        let (stop, folder) = (app.stop.clone(), app.config.places.changes());
         let worked = tokio::task::spawn_blocking(move || {
             let path = FilePath::new(residual_tif::NAME);
             let (mut before, mut after) = (ResidualFile::read(files.0, path)?, ResidualFile::read(files.1, path)?);
+            let folder = tempfile::tempdir_in(&folder).map_err(|e| stria_core::Error::io(&folder, e))?;
+            let mut difference = ResidualWriter::new(folder.path(), MAP_NAME);
             let found = change::compare(
                 &mut change::Run { residual: &mut before, list: &read.0 },
                 &mut change::Run { residual: &mut after, list: &read.1 },
                 &task.options,
-                &mut |_| if stop.is_cancelled() { Err(stria_core::Error::Cancelled) } else { Ok(()) },
+                &mut |strip| match stop.is_cancelled() {
+                    true => Err(stria_core::Error::Cancelled),
+                    false => difference.push(strip),
+                },
             )?;
-            Ok::<_, stria_core::Error>(report_of(task.before.job, task.after.job, found))
+            let difference = difference.finish()?.then_some(folder);
+            Ok::<_, stria_core::Error>(Worked { report: report_of(task.before.job, task.after.job, found), difference })
         });
         let worked = worked.await.map_err(|e| Error::Internal(format!("the comparison stopped: {e}")))?;
         worked.map_err(|e| Error::from_core("change", e))
@@ -215,7 +237,7 @@ pub(super) struct ChangeQuery {
     before: Option<String>,
 }
 
-/// What changed from an earlier job to this one: the same asset, the same direction. A comparison that takes longer than
+/// What changed from an earlier job to this one, of the same asset, either way along it. A comparison that takes longer than
 /// some seconds is answered with 202 and goes on; whoever asks again gets it.
 #[utoipa::path(get, path = "/api/jobs/{job}/change", tag = "defects",
     params(("job" = String, Path, description = "The later job"), ChangeQuery),
@@ -228,25 +250,63 @@ pub(super) async fn get_change(
     Path(job): Path<String>,
     Query(query): Query<ChangeQuery>,
 ) -> Result<Response> {
-    let after = Side::of(&app, &job).await?;
+    Ok(match worked_out(&app, &job, query).await? {
+        Some(worked) => axum::Json(worked.report.clone()).into_response(),
+        None => come_back(),
+    })
+}
+
+/// The map of that change as a GeoTIFF like `residual.tif`: later less earlier, mm, in the earlier run's world, its slow part
+/// taken off; NaN where not both measured.
+#[utoipa::path(get, path = "/api/jobs/{job}/change/difference.tif", tag = "defects",
+    params(("job" = String, Path, description = "The later job"), ChangeQuery),
+    responses((status = 200, content_type = "image/tiff", body = Vec<u8>),
+        (status = 202, description = "It is being worked out; `Retry-After` says when to come back"),
+        (status = 400, body = Problem, content_type = "application/problem+json"),
+        (status = 404, body = Problem, content_type = "application/problem+json")))]
+pub(super) async fn get_difference(
+    State(app): State<App>,
+    Path(job): Path<String>,
+    Query(query): Query<ChangeQuery>,
+) -> Result<Response> {
+    let Some(worked) = worked_out(&app, &job, query).await? else { return Ok(come_back()) };
+    let Some(folder) = &worked.difference else {
+        let what = "the two runs have no place in common that both measured".to_string();
+        return Err(Error::Input { detail: what, field: Some("before".into()), expected: None });
+    };
+    let path = folder.path().join(MAP_NAME);
+    // Open, it stays even when the comparison is forgotten.
+    let file = tokio::fs::File::open(&path).await.map_err(|e| Error::Internal(format!("{}: {e}", path.display())))?;
+    let save_as = format!("attachment; filename=\"{MAP_NAME}\"");
+    let headers = [(CONTENT_TYPE, "image/tiff".to_string()), (CONTENT_DISPOSITION, save_as)];
+    Ok((headers, Body::from_stream(ReaderStream::new(file))).into_response())
+}
+
+fn come_back() -> Response {
+    (StatusCode::ACCEPTED, [(RETRY_AFTER, COME_BACK_S.to_string())]).into_response()
+}
+
+/// The comparison of an earlier job with this one; `None` where it takes longer than a request waits.
+async fn worked_out(app: &App, job: &str, query: ChangeQuery) -> Result<Option<Arc<Worked>>> {
+    let after = Side::of(app, job).await?;
     let Some(before) = query.before else {
         return Err(Error::field("before", "the query names no earlier job", "before=JOB, a job of the same asset"));
     };
-    let before = Side::of(&app, &before).await?;
+    let before = Side::of(app, &before).await?;
     if before.asset != after.asset {
         let found = format!("the earlier job is of {:?}, the later one of {:?}", before.asset, after.asset);
         return Err(Error::field("before", found, "two jobs of the same asset"));
     }
-    let recipe = Recipe::from_toml("recipe", &app.runs.recipe_toml(&job).await?);
+    let recipe = Recipe::from_toml("recipe", &app.runs.recipe_toml(job).await?);
     let options = recipe.map_err(|e| Error::Internal(format!("the recipe of job {job}: {e}")))?.defects;
-    let mut receiver = app.changes.of(&app, Task { before, after, options })?;
+    let mut receiver = app.changes.of(app, Task { before, after, options })?;
     let outcome = match tokio::time::timeout(WAIT, receiver.wait_for(Option::is_some)).await {
         Ok(Ok(outcome)) => outcome.clone(),
         Ok(Err(_)) => return Err(Error::Internal("the comparison ended without a word".into())),
-        Err(_) => return Ok((StatusCode::ACCEPTED, [(RETRY_AFTER, COME_BACK_S.to_string())]).into_response()),
+        Err(_) => return Ok(None),
     };
     match outcome {
-        Some(Ok(report)) => Ok(axum::Json(report.as_ref().clone()).into_response()),
+        Some(Ok(worked)) => Ok(Some(worked)),
         Some(Err(refusal)) => Err(refusal.into()),
         None => Err(Error::Internal("the comparison ended without a result".into())),
     }

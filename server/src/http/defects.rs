@@ -9,7 +9,7 @@ use serde_json::json;
 use utoipa::IntoParams;
 
 use super::App;
-use super::extract::{Json, Path, Query};
+use super::extract::{IfMatch, Json, Path, Query};
 use crate::auth::Visitor;
 use crate::defects::{DefectFilter, DefectSort};
 use crate::error::{Error, Result};
@@ -98,18 +98,20 @@ pub(super) async fn get_defect(State(app): State<App>, Path(defect): Path<String
 
 /// Changes what people say about a defect: its state, a comment.
 #[utoipa::path(patch, path = "/api/defects/{defect}", tag = "defects",
-    params(("defect" = String, Path, description = "The defect")), request_body = DefectChange,
+    params(("defect" = String, Path, description = "The defect"),
+        ("If-Match" = Option<String>, Header, description = "The defect's `version`, quoted: changes nothing where it has another by now")),
+    request_body = DefectChange,
     responses((status = 200, body = Defect), (status = 400, body = Problem, content_type = "application/problem+json"),
         (status = 404, body = Problem, content_type = "application/problem+json"),
-        (status = 409, body = Problem, content_type = "application/problem+json",
-            description = "Somebody else has changed it since that version")))]
+        (status = 412, body = Problem, content_type = "application/problem+json", description = "Somebody else has changed it")))]
 pub(super) async fn change_defect(
     State(app): State<App>,
     Extension(visitor): Extension<Visitor>,
     Path(defect): Path<String>,
+    IfMatch(versions): IfMatch,
     Json(change): Json<DefectChange>,
 ) -> Result<Response> {
-    Ok(axum::Json(app.defects.change(&defect, change, &visitor.name).await?).into_response())
+    Ok(axum::Json(app.defects.change(&defect, change, versions.as_deref(), &visitor.name).await?).into_response())
 }
 
 #[derive(Deserialize, IntoParams)]

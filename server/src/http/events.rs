@@ -21,7 +21,7 @@ use crate::wire::{Job, JobEvent, JobState, Problem, RecordingSegment};
 
 /// Least time between two looks at the records.
 const AT_MOST_EVERY: Duration = Duration::from_millis(200);
-/// Longest time between them: a change by another process rings no bell here.
+/// Longest time between them: with SQLite, or without its NOTIFY, other processes ring no bell here.
 const AT_LEAST_EVERY: Duration = Duration::from_secs(1);
 /// So often a line goes out even when nothing happens, which tells a dead connection from a quiet one.
 const KEEP_ALIVE: Duration = Duration::from_secs(15);

@@ -2,6 +2,7 @@
 
 use axum::extract::{FromRequest, FromRequestParts, Request};
 use axum::http::StatusCode;
+use axum::http::header::IF_MATCH;
 use axum::http::request::Parts;
 use axum::response::{IntoResponse, Response};
 use serde::de::DeserializeOwned;
@@ -37,6 +38,22 @@ impl<S: Send + Sync, T: DeserializeOwned> FromRequestParts<S> for Query<T> {
             Ok(axum::extract::Query(value)) => Ok(Query(value)),
             Err(e) => Err(Error::field("query", e.body_text(), "the parameters that /api/openapi.json lists")),
         }
+    }
+}
+
+/// The versions that `If-Match` names; `None` where any will do.
+pub(super) struct IfMatch(pub Option<Vec<String>>);
+
+impl<S: Send + Sync> FromRequestParts<S> for IfMatch {
+    type Rejection = Error;
+
+    async fn from_request_parts(parts: &mut Parts, _: &S) -> Result<Self, Error> {
+        let said: Vec<&str> = parts.headers.get_all(IF_MATCH).iter().filter_map(|v| v.to_str().ok()).collect();
+        let each = || said.iter().flat_map(|line| line.split(',')).map(str::trim);
+        if !parts.headers.contains_key(IF_MATCH) || each().any(|v| v == "*") {
+            return Ok(IfMatch(None));
+        }
+        Ok(IfMatch(Some(each().map(|v| v.trim_matches('"').to_string()).collect())))
     }
 }
 

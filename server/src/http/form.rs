@@ -20,9 +20,9 @@ use crate::wire::Direction;
 /// Most bytes between two parts of a form: heads, and what the form's reader reads ahead.
 const HEAD_BYTES: u64 = 4 * 1024 * 1024;
 
-/// How much, and for how long, is read from a sender whose request was refused already.
+/// How much, and for how long, is read from a sender of a file whose request was refused already.
 const DRAIN_BYTES: u64 = 1_000_000_000;
-const DRAIN_TIME: Duration = Duration::from_secs(30);
+pub(super) const DRAIN_TIME: Duration = Duration::from_secs(30);
 
 /// The sender left, or sent what no body may hold.
 #[derive(Debug, thiserror::Error)]
@@ -72,9 +72,9 @@ impl Body {
     }
 
     /// Reads on and throws away, within limits.
-    pub(super) async fn drain(mut self) {
+    pub(super) async fn drain(mut self, longest: Duration) {
         self.state().left = DRAIN_BYTES;
-        let _ = tokio::time::timeout(DRAIN_TIME, async { while let Some(Ok(_)) = self.next().await {} }).await;
+        let _ = tokio::time::timeout(longest, async { while let Some(Ok(_)) = self.next().await {} }).await;
     }
 }
 

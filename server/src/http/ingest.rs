@@ -54,7 +54,7 @@ pub(super) async fn create_run(State(app): State<App>, request: Request) -> Resp
             // Whoever is still sending would take a closed connection for a broken one and never read the answer;
             // who asked first (Expect: 100-continue) has not begun to send.
             if !waits_for_word {
-                tokio::spawn(body.drain());
+                tokio::spawn(body.drain(form::DRAIN_TIME));
             }
             error.into_response()
         }

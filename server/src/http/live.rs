@@ -353,7 +353,8 @@ pub(super) async fn post_stream(State(app): State<App>, Path(stream): Path<Strin
     match result {
         Ok(ended) => (StatusCode::OK, Json(ended)).into_response(),
         Err(error) => {
-            tokio::spawn(body.drain());
+            // A robot that hears no answer while it sends, such as ffmpeg, notices when the connection ends, and comes again.
+            tokio::spawn(body.drain(LAST_WORDS));
             error.into_response()
         }
     }

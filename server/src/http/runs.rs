@@ -1,13 +1,12 @@
 //! Runs: list, read, change, delete, get the source back, process again.
 
 use axum::extract::State;
-use axum::http::header::IF_MATCH;
 use axum::http::{HeaderMap, Method, StatusCode};
 use axum::response::{IntoResponse, Response};
 use serde::Deserialize;
 use utoipa::IntoParams;
 
-use super::extract::{Json, Path, Query};
+use super::extract::{IfMatch, Json, Path, Query};
 use super::files::{self, FileAnswer, IMMUTABLE};
 use super::{App, ingest};
 use crate::error::Result;
@@ -69,21 +68,10 @@ pub(super) async fn get_run(State(app): State<App>, Path(run): Path<String>) -> 
 pub(super) async fn change_run(
     State(app): State<App>,
     Path(run): Path<String>,
-    headers: HeaderMap,
+    IfMatch(versions): IfMatch,
     Json(change): Json<RunChange>,
 ) -> Result<Response> {
-    let versions = wanted_versions(&headers);
     Ok(axum::Json(app.runs.change(&run, change, versions.as_deref()).await?).into_response())
-}
-
-/// The versions that `If-Match` names; `None` where any will do.
-fn wanted_versions(headers: &HeaderMap) -> Option<Vec<String>> {
-    let said: Vec<&str> = headers.get_all(IF_MATCH).iter().filter_map(|v| v.to_str().ok()).collect();
-    let each = || said.iter().flat_map(|line| line.split(',')).map(str::trim);
-    if !headers.contains_key(IF_MATCH) || each().any(|v| v == "*") {
-        return None;
-    }
-    Some(each().map(|v| v.trim_matches('"').to_string()).collect())
 }
 
 /// Deletes a run with its jobs and all their files; a job that runs is stopped.

@@ -20,7 +20,7 @@ use tokio_util::task::TaskTracker;
 use self::checksum::{CHECKSUMS, Checksum};
 use super::App;
 use super::extract::Path;
-use super::form::{Body, Fields};
+use super::form::{self, Body, Fields};
 use super::ingest::{content_type_of, idempotency_key};
 use super::problem::Refusal;
 use crate::error::{Error, Result};
@@ -217,7 +217,7 @@ where
     };
     // Whoever is still sending would take a closed connection for a broken one and never read the answer.
     if !waits_for_word {
-        tokio::spawn(body.drain());
+        tokio::spawn(body.drain(form::DRAIN_TIME));
     }
     response
 }

@@ -3,6 +3,8 @@
 
 use std::time::{Duration, Instant};
 
+use tokio_util::sync::CancellationToken;
+
 use super::tests::{Records, outcome};
 use super::*;
 use crate::config::JobLimits;
@@ -38,10 +40,15 @@ async fn work(queue: Queue, worker: usize) -> usize {
     done
 }
 
-/// Times from a job's enqueue to its claim by an idle worker, ms. `apart`: the worker is another process, which no bell
-/// reaches.
+/// Times from a job's enqueue to its claim by an idle worker, ms. `apart`: the worker is as in another process, with
+/// a bell of its own.
 async fn starts_ms(r: &Records, apart: bool) -> Vec<f64> {
     let queue = if apart { Queue::new(r.db.clone(), JobLimits::default()) } else { r.queue.clone() };
+    let stop = CancellationToken::new();
+    let _stopped = stop.clone().drop_guard();
+    for bell in [r.queue.bell(), queue.bell()] {
+        tokio::spawn(bell.clone().relay(r.db.clone(), stop.clone()));
+    }
     let claimer = tokio::spawn(async move {
         let mut changes = queue.bell().listen();
         let mut claimed = Vec::new();

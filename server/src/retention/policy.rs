@@ -12,7 +12,7 @@ use crate::db::Db;
 use crate::db::tables::{job, pin, product, run};
 use crate::error::{Error, Result};
 use crate::wire::time::{now_ms, to_text};
-use crate::wire::{Doomed, JobState, RetentionPreview};
+use crate::wire::{Doomed, JobState, RetentionPreview, RetentionRules};
 
 /// Runs that are looked at in one query.
 const AT_ONCE: u64 = 500;
@@ -88,8 +88,8 @@ impl Policy {
         }
     }
 
-    /// What would go now, in words that people read before it goes.
-    pub async fn preview(&self, db: &Db) -> Result<RetentionPreview> {
+    /// What would go now, in words that people read before it goes; beside the rules that hold.
+    pub async fn preview(&self, db: &Db, rules: RetentionRules) -> Result<RetentionPreview> {
         let going = self.going(db).await?;
         let of = |g: &Going| Doomed {
             run: g.run.clone(),
@@ -105,6 +105,7 @@ impl Policy {
             runs: going.len() as u64,
             freed_bytes: going.iter().map(|g| g.bytes).sum(),
             items: going.iter().take(LISTED).map(of).collect(),
+            rules,
         })
     }
 }

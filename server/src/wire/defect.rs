@@ -99,8 +99,8 @@ pub struct Defect {
     pub state: DefectState,
     /// What people wrote.
     pub comment: String,
-    /// Grows with every change of state or comment; 0: nobody has said anything.
-    pub version: i64,
+    /// Another after every change of state or comment; a PATCH that brings it as `If-Match` changes nothing else.
+    pub version: String,
     /// When people last changed state or comment (RFC 3339).
     pub changed_at: Option<String>,
     /// Who did: the name of a token or a session.
@@ -126,8 +126,6 @@ pub struct DefectChange {
     pub state: Option<DefectState>,
     /// Words for people, at most 4,000 characters.
     pub comment: Option<String>,
-    /// The version that the writer has seen: where somebody else has changed the defect since, nothing is changed (409).
-    pub version: Option<i64>,
 }
 
 /// One defect over the runs that passed its place.
@@ -135,7 +133,7 @@ pub struct DefectChange {
 pub struct DefectHistory {
     /// The defect that was asked for.
     pub defect: Defect,
-    /// The runs of its asset and direction that passed its place, the one recorded last first.
+    /// The runs of its asset that passed its place, either way, the one recorded last first.
     pub items: Vec<DefectSighting>,
 }
 

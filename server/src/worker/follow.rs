@@ -11,7 +11,7 @@ use crate::queue::Lease;
 use crate::source::{self, FILE, StoredSegment};
 use crate::store::Key;
 
-/// How long an open source is waited for before it is looked at again: another process's segments ring no bell here.
+/// How long an open source is waited for before it is looked at again: a ring of another process may be lost.
 const LOOK_EVERY: Duration = Duration::from_millis(200);
 
 /// Segments of one look.

@@ -238,7 +238,7 @@ impl<W: Write> PartWriter<'_, W> {
             topic::VIDEO => how.frames && self.plan.keeps_video(time_ns) && (how.every == 1 || video_key(&message)?),
             topic::IMAGE | topic::RAW => how.frames && self.plan.keeps_frame(time_ns),
             topic::TRANSFORMS | topic::PROFILE | topic::MEASUREMENT => self.plan.keeps_frame(time_ns),
-            topic::SURFACE => return self.part_of_surface(message),
+            topic::SURFACE | topic::SURFACE_OVERVIEW => return self.part_of_surface(message),
             topic::DEPTH_MAP => self.piece_is_there(&message)?,
             _ => true,
         };

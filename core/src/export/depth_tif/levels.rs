@@ -1,7 +1,8 @@
-//! A whole smaller size of a `depth.tif`, for what is made from a map long after its job.
+//! A smaller size of a `depth.tif`, or of a stretch of it, for what is made from a map long after its job.
 
 use std::fs::File;
 use std::io::BufReader;
+use std::ops::{Range, RangeInclusive};
 use std::path::Path;
 
 use tiff::TiffError;
@@ -11,7 +12,7 @@ use tiff::tags::Tag;
 use crate::depth_map::MapGeometry;
 use crate::error::{Error, Result};
 
-/// One size of the map, whole.
+/// One size of the map, or of a stretch of it.
 pub struct LevelDepths {
     /// Where its pixels lie: a pixel is the mean of what was measured in it.
     pub geometry: MapGeometry,
@@ -19,11 +20,11 @@ pub struct LevelDepths {
     pub depth_mm: Vec<f32>,
 }
 
-/// The largest size of the map at `path` that has at most so many pixels.
+/// The largest size of the map at `path` of which the stretch `x_mm` of the world has at most so many pixels; that stretch.
 ///
 /// # Errors
-/// What is no TIFF, or none of Stria's; a damaged file.
-pub fn level_of_at_most(path: &Path, pixels: usize) -> Result<LevelDepths> {
+/// What is no TIFF, or none of Stria's; a damaged file; a stretch beside the map.
+pub fn level_of_at_most(path: &Path, pixels: usize, x_mm: &RangeInclusive<f64>) -> Result<LevelDepths> {
     let file = File::open(path).map_err(|e| Error::io(path, e))?;
     let failed = |e| failed(path, e);
     let mut decoder = Decoder::new(BufReader::new(file)).map_err(failed)?;
@@ -33,48 +34,81 @@ pub fn level_of_at_most(path: &Path, pixels: usize) -> Result<LevelDepths> {
         return Err(Error::input(path.display().to_string(), found, "a depth.tif of stria"));
     }
     let mut factor = 1.0;
-    loop {
-        let (width, height) = decoder.dimensions().map_err(failed)?;
-        if width as usize * height as usize <= pixels || !decoder.more_images() {
-            break;
+    let (geometry, columns) = loop {
+        let geometry = geometry(&mut decoder, path, &matrix, factor)?;
+        let columns = columns_within(&geometry, x_mm);
+        if columns.len() * geometry.height_px <= pixels || !decoder.more_images() {
+            break (geometry, columns);
         }
         decoder.next_image().map_err(failed)?;
         factor *= 2.0;
+    };
+    if columns.is_empty() {
+        let found = format!("{:.0} to {:.0} mm of the run's own x is beside the map", x_mm.start(), x_mm.end());
+        let end_mm = geometry.x0_mm + geometry.width_px as f64 * geometry.mm_per_px;
+        let expected = format!("a part of {:.0} to {end_mm:.0} mm", geometry.x0_mm);
+        return Err(Error::input(path.display().to_string(), found, expected));
     }
-    let mut level = read(&mut decoder, path, &matrix, factor)?;
+    let mut level = read(&mut decoder, path, &geometry, columns)?;
     while level.depth_mm.len() > pixels.max(1) && level.depth_mm.len() > 1 {
         level = level.halved();
     }
     Ok(level)
 }
 
-/// The size that the decoder is at, `factor` times smaller than the full one.
-fn read(decoder: &mut Decoder<BufReader<File>>, path: &Path, matrix: &[f64], factor: f64) -> Result<LevelDepths> {
+/// Where the pixels of the size that the decoder is at lie, `factor` times smaller than the full one.
+fn geometry(decoder: &mut Decoder<BufReader<File>>, path: &Path, matrix: &[f64], factor: f64) -> Result<MapGeometry> {
     let (width_px, height_px) = decoder.dimensions().map_err(|e| failed(path, e))?;
-    let (width_px, height_px) = (width_px as usize, height_px as usize);
-    let (tile_width, tile_height) = decoder.chunk_dimensions();
-    let (tile_width, tile_height) = (tile_width as usize, tile_height as usize);
-    let across = width_px.div_ceil(tile_width);
-    let mut depth_mm = vec![f32::NAN; width_px * height_px];
-    for tile in 0..across * height_px.div_ceil(tile_height) {
-        let DecodingResult::F32(values) = decoder.read_chunk(tile as u32).map_err(|e| failed(path, e))? else {
-            return Err(Error::input(path.display().to_string(), "other values than float32", "a depth.tif of stria"));
-        };
-        let (left, top) = (tile % across * tile_width, tile / across * tile_height);
-        let width = tile_width.min(width_px - left);
-        for (row, values) in values.chunks_exact(width).take(height_px - top).enumerate() {
-            depth_mm[(top + row) * width_px + left..][..width].copy_from_slice(values);
-        }
-    }
     let shift_mm = (factor - 1.0) * matrix[0] / 2.0;
-    let geometry = MapGeometry {
+    Ok(MapGeometry {
         x0_mm: matrix[3] + shift_mm,
         y0_mm: matrix[7] + shift_mm,
         mm_per_px: matrix[0] * factor,
-        width_px,
-        height_px,
-    };
-    Ok(LevelDepths { geometry, depth_mm })
+        width_px: width_px as usize,
+        height_px: height_px as usize,
+    })
+}
+
+/// The columns whose centres lie in a stretch.
+fn columns_within(map: &MapGeometry, x_mm: &RangeInclusive<f64>) -> Range<usize> {
+    let column = |x_mm: f64| (x_mm - map.x0_mm) / map.mm_per_px;
+    // From minus to plus infinity: a number that is too large becomes the largest.
+    let (start, end) = (column(*x_mm.start()).ceil().max(0.0) as usize, (column(*x_mm.end()).floor() + 1.0).max(0.0));
+    start..(end as usize).min(map.width_px).max(start)
+}
+
+/// Some columns of the size that the decoder is at.
+fn read(
+    decoder: &mut Decoder<BufReader<File>>,
+    path: &Path,
+    map: &MapGeometry,
+    columns: Range<usize>,
+) -> Result<LevelDepths> {
+    let (tile_width, tile_height) = decoder.chunk_dimensions();
+    let (tile_width, tile_height) = (tile_width as usize, tile_height as usize);
+    let across = map.width_px.div_ceil(tile_width);
+    let mut depth_mm = vec![f32::NAN; columns.len() * map.height_px];
+    for tile_row in 0..map.height_px.div_ceil(tile_height) {
+        for tile_column in columns.start / tile_width..columns.end.div_ceil(tile_width) {
+            let tile = (tile_row * across + tile_column) as u32;
+            let DecodingResult::F32(values) = decoder.read_chunk(tile).map_err(|e| failed(path, e))? else {
+                return Err(Error::input(
+                    path.display().to_string(),
+                    "other values than float32",
+                    "a depth.tif of stria",
+                ));
+            };
+            let (left, top) = (tile_column * tile_width, tile_row * tile_height);
+            let width = tile_width.min(map.width_px - left);
+            let (from, to) = (left.max(columns.start), (left + width).min(columns.end));
+            for (row, values) in (top..map.height_px).zip(values.chunks_exact(width)) {
+                depth_mm[row * columns.len() + from - columns.start..][..to - from]
+                    .copy_from_slice(&values[from - left..to - left]);
+            }
+        }
+    }
+    let x0_mm = map.x0_mm + columns.start as f64 * map.mm_per_px;
+    Ok(LevelDepths { geometry: MapGeometry { x0_mm, width_px: columns.len(), ..*map }, depth_mm })
 }
 
 impl LevelDepths {

@@ -1,5 +1,7 @@
 //! Light from the upper left: what shows a dent of two millimetres on a wall that leans by fifty.
 
+use std::collections::VecDeque;
+
 use super::reduce::Reduced;
 
 /// Smoothing before the slopes are taken, px.
@@ -86,34 +88,71 @@ fn difference(before: Option<f32>, here: f32, after: Option<f32>) -> f32 {
 /// NaN. Radii: along the rows, along the columns.
 fn blurred(values: &[f32], width: usize, height: usize, radii: (usize, usize)) -> Vec<f32> {
     let mut result = values.to_vec();
+    let mut counts = vec![0.0; values.len()];
     for _ in 0..2 {
-        let (mut sums, mut counts): (Vec<f32>, Vec<f32>) =
-            result.iter().map(|v| if v.is_finite() { (*v, 1.0) } else { (0.0, 0.0) }).unzip();
-        for plane in [&mut sums, &mut counts] {
-            for row in plane.chunks_exact_mut(width) {
-                slide(row, radii.0);
-            }
-            let mut line = vec![0.0; height];
-            for column in 0..width {
-                line.iter_mut().enumerate().for_each(|(row, v)| *v = plane[row * width + column]);
-                slide(&mut line, radii.1);
-                line.iter().enumerate().for_each(|(row, v)| plane[row * width + column] = *v);
-            }
+        for (value, count) in result.iter_mut().zip(&mut counts) {
+            (*value, *count) = if value.is_finite() { (*value, 1.0) } else { (0.0, 0.0) };
         }
-        for (i, value) in result.iter_mut().enumerate().filter(|(_, v)| v.is_finite()) {
-            *value = sums[i] / counts[i];
+        for plane in [&mut result, &mut counts] {
+            plane.chunks_mut(LINES * width).for_each(|rows| slide_along(rows, width, radii.0));
+            slide_down(plane, width, height, radii.1);
+        }
+        for ((mean, count), value) in result.iter_mut().zip(&counts).zip(values) {
+            *mean = if value.is_finite() { *mean / count } else { f32::NAN };
         }
     }
     result
 }
 
-/// The sum over the neighbours up to `radius` away, in place.
-fn slide(line: &mut [f32], radius: usize) {
-    let source = line.to_vec();
-    let mut sum: f64 = source.iter().take(radius).map(|v| f64::from(*v)).sum();
-    for (i, value) in line.iter_mut().enumerate() {
-        sum += source.get(i + radius).map_or(0.0, |v| f64::from(*v));
-        sum -= i.checked_sub(radius + 1).map_or(0.0, |j| f64::from(source[j]));
-        *value = sum as f32;
+/// Rows that are summed at the same time: one sum waits for the one before it, several do not wait for each other.
+const LINES: usize = 8;
+
+/// Each value becomes the sum of its neighbours up to `radius` away in its row; up to [`LINES`] rows.
+fn slide_along(rows: &mut [f32], width: usize, radius: usize) {
+    let source = rows.to_vec();
+    let count = rows.len() / width;
+    let mut sums = [0.0_f64; LINES];
+    let add = |sums: &mut [f64; LINES], column: usize, sign: f64| {
+        for (line, sum) in sums.iter_mut().enumerate().take(count) {
+            *sum += sign * f64::from(source[line * width + column]);
+        }
+    };
+    (0..radius.min(width)).for_each(|column| add(&mut sums, column, 1.0));
+    for column in 0..width {
+        if column + radius < width {
+            add(&mut sums, column + radius, 1.0);
+        }
+        if column > radius {
+            add(&mut sums, column - radius - 1, -1.0);
+        }
+        for (line, sum) in sums.iter().enumerate().take(count) {
+            rows[line * width + column] = *sum as f32;
+        }
+    }
+}
+
+/// Each value becomes the sum of its neighbours up to `radius` away in its column.
+fn slide_down(plane: &mut [f32], width: usize, height: usize, radius: usize) {
+    // The rows that a later row still takes away, as they were.
+    let mut kept: VecDeque<Vec<f32>> = VecDeque::with_capacity(radius + 2);
+    let mut sums = vec![0.0_f64; width];
+    let add = |sums: &mut [f64], row: &[f32]| sums.iter_mut().zip(row).for_each(|(s, v)| *s += f64::from(*v));
+    for row in plane.chunks_exact(width).take(radius) {
+        add(&mut sums, row);
+    }
+    for row in 0..height {
+        if row + radius < height {
+            add(&mut sums, &plane[(row + radius) * width..][..width]);
+        }
+        let mut spare = Vec::new();
+        if kept.len() > radius {
+            spare = kept.pop_front().unwrap_or_default();
+            sums.iter_mut().zip(&spare).for_each(|(s, v)| *s -= f64::from(*v));
+        }
+        let here = &mut plane[row * width..][..width];
+        spare.clear();
+        spare.extend_from_slice(here);
+        kept.push_back(spare);
+        here.iter_mut().zip(&sums).for_each(|(value, sum)| *value = *sum as f32);
     }
 }

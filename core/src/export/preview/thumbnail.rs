@@ -4,8 +4,8 @@ use std::path::Path;
 
 use jpeg_encoder::{ColorType, Encoder};
 
-use super::reduce::Reduced;
-use super::{Range, colour};
+use super::reduce::{Between, Reduced};
+use super::{Range, colour, reduce};
 use crate::error::{Error, Result};
 use crate::export::new_file;
 
@@ -34,15 +34,15 @@ impl Thumbnail {
         let top = (height - HEIGHT_PX as f64 * scale) / 2.0;
         let mut rgb = Vec::with_capacity(3 * WIDTH_PX * HEIGHT_PX);
         for row in 0..HEIGHT_PX {
+            let y = Between::of(top + (row as f64 + 0.5) * scale - 0.5, map.height_px);
             for column in 0..WIDTH_PX {
-                let x = left + (column as f64 + 0.5) * scale - 0.5;
-                let y = top + (row as f64 + 0.5) * scale - 0.5;
-                let z_mm = Reduced::at(&map.depth_mm, map.width_px, map.height_px, x, y);
+                let x = Between::of(left + (column as f64 + 0.5) * scale - 0.5, map.width_px);
+                let z_mm = reduce::between(&map.depth_mm, map.width_px, x, y);
                 rgb.extend(if z_mm.is_nan() {
                     NOTHING
                 } else {
                     let share = (f64::from(z_mm) - range.near_mm) / (range.far_mm - range.near_mm);
-                    colour::shaded(ramp.at(share), Reduced::at(shades, map.width_px, map.height_px, x, y))
+                    colour::shaded(ramp.at(share), reduce::between(shades, map.width_px, x, y))
                 });
             }
         }

@@ -4,7 +4,7 @@ use base64::Engine;
 use base64::engine::general_purpose::STANDARD;
 
 use crate::defects::{Defect, DefectList};
-use crate::depth_map::{MapReader, MapWindow};
+use crate::depth_map::{MapReader, MapWindow, rectangles, written};
 use crate::error::Result;
 use crate::export::residual_tif::ResidualFile;
 use crate::export::texture::small_jpeg;
@@ -15,17 +15,26 @@ const STRIP_PX: usize = 1100;
 const STRIP_MM: f64 = 2000.0;
 /// Strips of the overview, at most: a longer run is shown smaller.
 const MAX_STRIPS: usize = 24;
+/// Cells of the residual that are read at once for a strip, about.
+const BAND_CELLS: usize = 4_000_000;
 /// A cut-out's longer side, px.
 const CUT_PX: usize = 260;
 /// How much of the surroundings a cut-out shows, in sizes of the defect, and at least, mm.
 const CUT_SIZES: f64 = 2.0;
 const CUT_MIN_MM: f64 = 80.0;
+/// Widest cut-out, px of the map: of a larger defect its deepest place is shown.
+const CUT_MOST_PX: f64 = 2048.0;
 
 /// Residual to colour: red away from the camera, blue towards it, pale where nothing is.
 pub(super) struct Colours {
     /// The residual of the strongest colour, mm.
     pub reach_mm: f64,
+    /// From the strongest towards the camera to the strongest away from it.
+    ramp: Vec<[u8; 3]>,
 }
+
+/// Steps of the colours from pale to either end: more than a picture shows.
+const STEPS: i32 = 512;
 
 impl Colours {
     /// Colours that show a list's defects.
@@ -33,15 +42,21 @@ impl Colours {
         let mut depths: Vec<f64> = list.defects.iter().map(|d| d.depth_mm.abs()).collect();
         depths.sort_by(f64::total_cmp);
         let typical = depths.get(depths.len() * 7 / 10).copied().unwrap_or(0.0);
-        Colours { reach_mm: typical.max(2.0 * list.detection_limit_mm).max(1.0) }
+        let ramp = (-STEPS..=STEPS).map(|step| Colours::mixed(f64::from(step) / f64::from(STEPS))).collect();
+        Colours { reach_mm: typical.max(2.0 * list.detection_limit_mm).max(1.0), ramp }
     }
 
     /// The colour of a residual, mm.
     pub(super) fn at(&self, residual_mm: f64) -> [u8; 3] {
+        let share = (residual_mm / self.reach_mm).clamp(-1.0, 1.0);
+        self.ramp[((share + 1.0) * f64::from(STEPS) + 0.5) as usize]
+    }
+
+    /// The colour of a share of the reach, -1 to 1.
+    fn mixed(share: f64) -> [u8; 3] {
         const PALE: [f64; 3] = [244.0, 243.0, 240.0];
         const AWAY: [f64; 3] = [165.0, 20.0, 30.0];
         const TOWARDS: [f64; 3] = [15.0, 60.0, 140.0];
-        let share = (residual_mm / self.reach_mm).clamp(-1.0, 1.0);
         let end = if share > 0.0 { AWAY } else { TOWARDS };
         // Small residuals show a little more than in proportion.
         let share = share.abs().powf(0.8);
@@ -71,9 +86,13 @@ pub(super) fn strips(residual: &mut ResidualFile, colours: &Colours) -> Result<V
     let mut strips = Vec::new();
     for first in (0..map.width_px).step_by(cells) {
         let columns = cells.min(map.width_px - first);
-        let window = residual.window(first, 0, columns, map.height_px)?;
         let (width_px, height_px) = (columns.div_ceil(factor), map.height_px.div_ceil(factor));
-        let pixels = shrunk(&window, factor, colours);
+        let mut pixels = Vec::with_capacity(width_px * height_px);
+        // Whole lines of the picture at once.
+        let band_px = (BAND_CELLS / (columns * factor)).max(1) * factor;
+        for [_, top, _, rows] in rectangles([columns, map.height_px], [columns, band_px]) {
+            pixels.extend(shrunk(&residual.window(first, top, columns, rows)?, factor, colours));
+        }
         strips.push(Placed {
             width_px,
             height_px,
@@ -88,7 +107,7 @@ pub(super) fn strips(residual: &mut ResidualFile, colours: &Colours) -> Result<V
 /// The mean residual of each square, as a colour; none where nothing was measured.
 fn shrunk(window: &MapWindow, factor: usize, colours: &Colours) -> Vec<Option<[u8; 3]>> {
     let (width, height) = (window.width_px.div_ceil(factor), window.height_px.div_ceil(factor));
-    let mut sums = vec![(0.0_f64, 0.0_f64); width * height];
+    let mut sums = written((0.0_f64, 0.0_f64), width * height);
     for (row, line) in window.depth_mm.chunks_exact(window.width_px).enumerate() {
         for (column, value) in line.iter().enumerate().filter(|(_, v)| v.is_finite()) {
             let sum = &mut sums[row / factor * width + column / factor];
@@ -121,8 +140,11 @@ pub(super) fn views(
     residual: &mut ResidualFile,
     colours: &Colours,
 ) -> Result<Views> {
-    let side_mm = (CUT_SIZES * defect.length_mm.max(defect.width_mm)).max(CUT_MIN_MM);
-    let centre = (defect.x_mm, defect.y_mm);
+    let deepest = (defect.deepest_x_mm, defect.deepest_y_mm);
+    let whole_mm = (CUT_SIZES * defect.length_mm.max(defect.width_mm)).max(CUT_MIN_MM);
+    let most_mm = CUT_MOST_PX * map.geometry().mm_per_px;
+    let (centre, side_mm) =
+        if whole_mm <= most_mm { ((defect.x_mm, defect.y_mm), whole_mm) } else { (deepest, most_mm) };
     let (near, texture_window) = (cut(residual, centre, side_mm)?, cut(map, centre, side_mm)?);
     let factor = near.window.width_px.div_ceil(CUT_PX).max(1);
     let residual_view = near.picture(factor, &shrunk(&near.window, factor, colours))?;
@@ -133,7 +155,6 @@ pub(super) fn views(
         }
         false => None,
     };
-    let deepest = (defect.deepest_x_mm, defect.deepest_y_mm);
     Ok(Views {
         along_x: near.line(deepest, true),
         along_y: near.line(deepest, false),

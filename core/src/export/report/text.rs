@@ -6,6 +6,7 @@ use super::ReportRun;
 use super::drawings;
 use super::pictures::{Placed, Views};
 use crate::defects::{Defect, DefectKind, DefectList};
+use crate::motion::metric::Drift;
 
 /// An ovality of fewer standard deviations is not told from none.
 const TOLD_APART_SDS: f64 = 2.0;
@@ -43,6 +44,7 @@ pub(super) fn head(page: &mut String, run: &ReportRun, list: &DefectList) {
             ),
         ),
         ("Breaks of the way", quality.breaks.to_string()),
+        ("Drift of the places", drift(quality.drift.as_ref())),
         ("Found", found(list)),
         (
             "Detection limit",
@@ -64,6 +66,14 @@ pub(super) fn head(page: &mut String, run: &ReportRun, list: &DefectList) {
         });
         page.push_str("</ul>");
     }
+}
+
+fn drift(drift: Option<&Drift>) -> String {
+    let Some(drift) = drift else { return "not known for this way".into() };
+    format!(
+        "up to the end {:.1} mm along the way, {:.1} mm across it, {:.1} mm in depth (one standard deviation)",
+        drift.x_mm, drift.y_mm, drift.z_mm
+    )
 }
 
 fn reference(list: &DefectList) -> String {
@@ -246,7 +256,7 @@ pub(super) fn method(page: &mut String, run: &ReportRun, list: &DefectList) {
     }
     page.push_str(
         "<li>Cracks, discolouration, corrosion without relief and leaks are not looked for. Depths are along the viewing \
-         direction unless said otherwise. Positions along the chainage drift with the way travelled.</li></ul>",
+         direction unless said otherwise. Positions along the chainage drift with the way travelled (Drift of the places, above; an error of the rig adds to it).</li></ul>",
     );
 }
 

@@ -6,7 +6,8 @@
 
 use nalgebra::{DMatrix, DVector, Isometry3, Matrix3, Matrix6, Point3, SMatrix, Vector3, Vector6};
 
-use super::pose::{HUBER, moved, projection};
+use super::pose::{HUBER, MEDIAN_MISFIT, moved, projection};
+use crate::motion::similarity::median;
 
 /// Added to the diagonal, as a share of it (Levenberg and Marquardt): at first, least and most, and how it changes.
 const DAMPING: f64 = 1e-4;
@@ -68,6 +69,41 @@ impl PlaceDepth {
 
 type Block = SMatrix<f64, 6, 3>;
 
+/// Covariance of the last free view's pose as if the poses that are not free were certain: rotation, then translation, as
+/// [`moved`] takes them (rad, mm). How well the sights fit says how sure they are, whatever they say of themselves. `None`
+/// where nothing is free, or the equations do not tell it.
+pub(super) fn last_covariance(views: &[View], places: &[Place]) -> Option<Matrix6<f64>> {
+    let free = free_indices(views);
+    let count = free.iter().flatten().count();
+    let last = count.checked_sub(1)?;
+    let NormalEquations { normal, .. } = NormalEquations::of(views, places, &free, 0.0);
+    let mut unit = DMatrix::zeros(normal.nrows(), 6);
+    unit.fixed_view_mut::<6, 6>(6 * last, 0).copy_from(&Matrix6::identity());
+    let covariance: Matrix6<f64> = normal.cholesky()?.solve(&unit).fixed_view::<6, 6>(6 * last, 0).into();
+    let scaled = covariance * unit_variance(views, places, count)?;
+    scaled.iter().all(|v| v.is_finite()).then_some(scaled)
+}
+
+/// How much larger the squares of the sights' errors are than they should be (the variance of unit weight), from their
+/// median, so that wrong sights have no say; at least 1.
+fn unit_variance(views: &[View], places: &[Place], free_views: usize) -> Option<f64> {
+    let mut misfits: Vec<f64> = Vec::new();
+    for place in places {
+        misfits.extend(place.sights.iter().filter_map(|sight| {
+            let (seen, ..) = projection(&(views[sight.view].camera_from_world * place.world))?;
+            Some((sight.ray[0] - seen.x).hypot(sight.ray[1] - seen.y) / sight.sigma)
+        }));
+    }
+    let observed = 2 * misfits.len() + places.iter().map(|place| place.depths.len()).sum::<usize>();
+    // What was fitted to the sights takes its share of their errors away.
+    let spare = observed.checked_sub(3 * places.len() + 6 * free_views)?;
+    if spare == 0 || misfits.is_empty() {
+        return None;
+    }
+    let size = median(&mut misfits) / MEDIAN_MISFIT;
+    Some((size * size * observed as f64 / spare as f64).max(1.0))
+}
+
 /// Adjusts in at most `rounds` rounds; a round that would fit worse changes nothing.
 pub(super) fn adjust(views: &mut [View], places: &mut [Place], rounds: usize) {
     let mut damping = DAMPING;
@@ -108,31 +144,9 @@ fn total_cost(views: &[View], places: &[Place]) -> f64 {
 
 /// One round. False where the equations could not be solved; nothing has changed then.
 fn round(views: &mut [View], places: &mut [Place], damping: f64) -> bool {
-    let free: Vec<Option<usize>> = {
-        let mut next = 0;
-        views
-            .iter()
-            .map(|view| {
-                view.free.then(|| {
-                    next += 1;
-                    next - 1
-                })
-            })
-            .collect()
-    };
-    let count = free.iter().flatten().count();
-    let mut normal = DMatrix::<f64>::zeros(6 * count, 6 * count);
-    let mut right = DVector::<f64>::zeros(6 * count);
-    let mut eliminated: Vec<Eliminated> = Vec::with_capacity(places.len());
-    for place in places.iter() {
-        let equations = Equations::of(place, views, &free);
-        eliminated.push(equations.eliminate(&mut normal, &mut right, damping));
-    }
-    for i in 0..6 * count {
-        normal[(i, i)] *= 1.0 + damping;
-        normal[(i, i)] += 1e-9;
-    }
-    let delta = if count == 0 {
+    let free = free_indices(views);
+    let NormalEquations { normal, right, eliminated } = NormalEquations::of(views, places, &free, damping);
+    let delta = if right.is_empty() {
         right
     } else {
         let Some(solved) = normal.cholesky().map(|c| c.solve(&right)) else { return false };
@@ -157,6 +171,34 @@ fn round(views: &mut [View], places: &mut [Place], damping: f64) -> bool {
         }
     }
     true
+}
+
+/// For each view its number among the free ones.
+fn free_indices(views: &[View]) -> Vec<Option<usize>> {
+    let mut free = 0..;
+    views.iter().map(|view| if view.free { free.next() } else { None }).collect()
+}
+
+/// What the free poses must fulfil, the landmarks taken out.
+struct NormalEquations {
+    normal: DMatrix<f64>,
+    right: DVector<f64>,
+    eliminated: Vec<Eliminated>,
+}
+
+impl NormalEquations {
+    fn of(views: &[View], places: &[Place], free: &[Option<usize>], damping: f64) -> NormalEquations {
+        let count = free.iter().flatten().count();
+        let mut normal = DMatrix::<f64>::zeros(6 * count, 6 * count);
+        let mut right = DVector::<f64>::zeros(6 * count);
+        let mut eliminate = |place| Equations::of(place, views, free).eliminate(&mut normal, &mut right, damping);
+        let eliminated = places.iter().map(&mut eliminate).collect();
+        for i in 0..6 * count {
+            normal[(i, i)] *= 1.0 + damping;
+            normal[(i, i)] += 1e-9;
+        }
+        NormalEquations { normal, right, eliminated }
+    }
 }
 
 /// One landmark's part of the normal equations.

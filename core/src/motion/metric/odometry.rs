@@ -1,16 +1,20 @@
 //! Frame by frame: predict, find the landmarks, solve the pose; at key frames choose landmarks and adjust.
 
 mod choosing;
+mod drift;
 mod settling;
 
 use std::collections::{BTreeMap, HashMap, VecDeque};
 
 use nalgebra::{Isometry3, Point3, Vector3};
 
+use drift::Added;
+pub use drift::Drift;
+
 use super::bundle::{self, Place, PlaceDepth, PlaceSight, View};
 use super::landmark::{Landmark, Search};
 use super::patch::Found;
-use super::pose::{self, Sight};
+use super::pose::{self, MEDIAN_MISFIT, Sight};
 use super::view::FrameView;
 use crate::geometry::{RawPixel, WorldFromCamera};
 use crate::motion::similarity::{FEWEST_CORNERS, median, scale_and_residual};
@@ -52,8 +56,6 @@ const EARLY_KEYFRAMES: usize = 4;
 const EARLY_STEP: f64 = 0.2;
 /// Least and greatest standard deviation of a found place, px.
 const SIGMA_PX: (f64, f64) = (0.04, 1.0);
-/// Median distance of a sight with normal errors in two directions, in standard deviations.
-const MEDIAN_MISFIT: f64 = 1.18;
 /// Largest factor between how well patches seem to be found and how well they are, and how fast it is learned.
 const NOISE_RANGE: f64 = 12.0;
 const NOISE_GAIN: f64 = 0.3;
@@ -122,6 +124,8 @@ pub struct Odometry {
     part: u32,
     /// How much worse patches are found than they seem to be.
     noise: f64,
+    /// What the poses are open by; `None` before the first, and where a part of the way was not measured.
+    added: Option<Added>,
 }
 
 /// The frame before.
@@ -170,6 +174,7 @@ impl Odometry {
             carried_frames: 0,
             part: 0,
             noise: 1.0,
+            added: None,
         }
     }
 
@@ -208,9 +213,17 @@ impl Odometry {
     /// The run has ended: all poses are final.
     pub fn finish(&mut self) {
         self.adjust(ROUNDS);
+        self.add_drift(1);
         while let Some(waiting) = self.waiting.pop_front() {
             self.settle(waiting);
         }
+    }
+
+    /// How far the last pose may be off against the first one, once the run has ended; `None` where the way was broken, or
+    /// carried on by a given motion, and where the camera hardly moved: nothing is known of the errors there.
+    pub fn drift(&self) -> Option<Drift> {
+        let whole = self.part == 0 && self.carried_frames == 0;
+        self.added.as_ref().filter(|_| whole).and_then(Added::drift)
     }
 
     /// Frames, so far, whose image's motion was lost and whose pose the given motion carried on.
@@ -233,6 +246,7 @@ impl Odometry {
         }
         self.wait(view.frame, Some(pose), Vec::new(), 6);
         self.keyframes.push_back(Keyframe { number: self.next_keyframe, camera_from_world: pose, fixed: true });
+        self.added = Some(Added::from(self.next_keyframe, pose));
         self.next_keyframe += 1;
         self.choose_landmarks(view, profile, &pose);
         let places = self.alive_places(&pose);
@@ -313,6 +327,7 @@ impl Odometry {
             self.add_keyframe(pose, &followed.sights);
             let first = self.next_keyframe <= 2 * self.options.window;
             self.adjust(if first { ROUNDS_AT_START } else { ROUNDS });
+            self.add_drift(self.options.window);
             let adjusted = self.keyframes.back().map_or(pose, |k| k.camera_from_world);
             last.pose = adjusted;
             self.choose_landmarks(view, profile, &adjusted);
@@ -576,10 +591,11 @@ impl Odometry {
         sight.sigma.clamp(SIGMA_PX.0 / self.rig.camera.fx_px, self.noise * 0.15 / self.rig.camera.fx_px)
     }
 
-    fn adjust(&mut self, rounds: usize) {
+    /// The free key frames and what ties them, for the adjustment; and whose places the latter are.
+    fn window(&self) -> (Vec<View>, Vec<Place>, Vec<u32>) {
         let oldest = self.keyframes.front().map_or(0, |k| k.number);
         let index = |number: u32| (number - oldest) as usize;
-        let mut views: Vec<View> =
+        let views: Vec<View> =
             self.keyframes.iter().map(|k| View { camera_from_world: k.camera_from_world, free: !k.fixed }).collect();
         let newest_fixed = self.keyframes.iter().rev().find(|k| k.fixed).map_or(0, |k| k.number);
         let (mut ids, mut places) = (Vec::new(), Vec::new());
@@ -597,6 +613,11 @@ impl Odometry {
                 covariance: landmark.covariance,
             });
         }
+        (views, places, ids)
+    }
+
+    fn adjust(&mut self, rounds: usize) {
+        let (mut views, mut places, ids) = self.window();
         bundle::adjust(&mut views, &mut places, rounds);
         for (keyframe, view) in self.keyframes.iter_mut().zip(views) {
             keyframe.camera_from_world = view.camera_from_world;
@@ -607,6 +628,21 @@ impl Odometry {
                 landmark.covariance = place.covariance;
             }
         }
+    }
+
+    /// Adds up what the newest key frame is open by, `window` key frames after it was last added or later.
+    fn add_drift(&mut self, window: u32) {
+        let (Some(newest), Some(added)) = (self.keyframes.back(), &self.added) else { return };
+        if !added.is_due(newest.number, window) {
+            return;
+        }
+        let (number, pose) = (newest.number, newest.camera_from_world);
+        let (views, places, _) = self.window();
+        let own = bundle::last_covariance(&views, &places);
+        self.added = self.added.take().zip(own).map(|(mut added, own)| {
+            added.add(number, &pose, &own);
+            added
+        });
     }
 
     fn alive_places(&self, pose: &Isometry3<f64>) -> HashMap<u32, (f32, f32)> {

@@ -9,6 +9,9 @@ const SETTLED: f64 = 1e-6;
 /// A place further off than this many of its standard deviations counts less (Huber).
 pub(super) const HUBER: f64 = 2.0;
 
+/// Median distance of a sight with normal errors in two directions, in standard deviations.
+pub(super) const MEDIAN_MISFIT: f64 = 1.18;
+
 /// A place in the world and where it was seen.
 #[derive(Clone, Copy, Debug)]
 pub(super) struct Sight {

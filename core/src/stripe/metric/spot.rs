@@ -4,8 +4,9 @@
 const WINDOW_SHARE: f32 = 0.38;
 /// Samples on each side that show the surroundings.
 const SIDE: usize = 4;
-/// Rounds of the centroid, at most; it settles in four.
+/// Rounds of the centroid, at most; it has settled when it moves less than this, px.
 const ROUNDS: usize = 8;
+const SETTLED_PX: f32 = 0.02;
 /// The window ends this many of its standard deviations from its middle.
 const WINDOW_REACH: f32 = 2.83;
 /// Light in the window of a line of height 1 and width 1: √(2π) times the standard deviation of both bells together.
@@ -24,14 +25,6 @@ const PROBE_STEP: usize = 8;
 const NOISE_LEFT: f32 = 0.141;
 /// The pattern is not trusted below this light: division would lift noise.
 const PATTERN_MIN_LIGHT: f32 = 0.004;
-
-/// What lies under the line's light.
-pub(super) enum Background {
-    /// A straight slope between the two sides of the profile.
-    Sides,
-    /// Nothing: it was taken off already.
-    None,
-}
 
 /// A centre within a profile.
 pub(super) struct Spot {
@@ -62,16 +55,9 @@ impl SpotShape {
         2 * self.half + 1
     }
 
-    /// The centroid under a bell-shaped window that moves with it, to `settled_px`. `None` where there is no light or it
-    /// runs away.
-    pub(super) fn find(&self, profile: &[f32], background: Background, start: f32, settled_px: f32) -> Option<Spot> {
-        let (left, right) = match background {
-            Background::Sides => (side(&profile[..SIDE]), side(&profile[profile.len() - SIDE..])),
-            Background::None => (0.0, 0.0),
-        };
-        // The sides' middles are `SIDE` samples less apart than the profile is long.
-        let slope = (right - left) / (profile.len() - SIDE) as f32;
-        let level = left - slope * (SIDE as f32 - 1.0) / 2.0;
+    /// The centroid under a bell-shaped window that moves with it. `None` where there is no light or it runs away.
+    pub(super) fn find(&self, profile: &[f32], start: f32) -> Option<Spot> {
+        let (level, slope, left, right) = ground(profile);
         let (mut at, mut light) = (start, 0.0);
         for _ in 0..ROUNDS {
             let moment;
@@ -82,7 +68,7 @@ impl SpotShape {
             // Under a window as wide as the line the centroid goes half the way.
             let step = (2.0 * moment / light).clamp(-0.5 * self.width_px, 0.5 * self.width_px);
             at += step;
-            if step.abs() < settled_px {
+            if step.abs() < SETTLED_PX {
                 break;
             }
         }
@@ -146,22 +132,34 @@ impl SpotShape {
         (top > background).then(|| Some(crossing(middle, 1)? - crossing(middle, -1)?)).flatten()
     }
 
-    /// The profile's light above its sides, divided by the wall's pattern (1 on average), of which `trust` (0 to 1) is
-    /// believed. False where the pattern is too dark to tell.
+    /// The light above its sides of a profile divided by the wall's pattern, of which `trust` (0 to 1) is believed: the wall's
+    /// own light goes with its pattern as the laser's does. False where the pattern is too dark to tell.
     pub(super) fn divide(&self, profile: &[f32], pattern: &[f32], trust: f32, out: &mut [f32]) -> bool {
         let mean = pattern.iter().sum::<f32>() / pattern.len() as f32;
         if mean < PATTERN_MIN_LIGHT {
             return false;
         }
-        let (left, right) = (side(&profile[..SIDE]), side(&profile[profile.len() - SIDE..]));
-        let slope = (right - left) / (profile.len() - SIDE) as f32;
-        let offset = (SIDE as f32 - 1.0) / 2.0;
-        for (i, ((out, value), pattern)) in out.iter_mut().zip(profile).zip(pattern).enumerate() {
-            *out =
-                (value - left - slope * (i as f32 - offset)) * mean / (mean + trust * (pattern - mean)).max(0.2 * mean);
+        for ((out, value), pattern) in out.iter_mut().zip(profile).zip(pattern) {
+            *out = value * mean / (mean + trust * (pattern - mean)).max(0.2 * mean);
         }
+        lift(out);
         true
     }
+}
+
+/// Takes a straight slope between its two sides off a profile.
+fn lift(profile: &mut [f32]) {
+    let (level, slope, _, _) = ground(profile);
+    profile.iter_mut().enumerate().for_each(|(i, value)| *value -= level + slope * i as f32);
+}
+
+/// The straight slope between the two sides of a profile: light at its first sample, and more a sample; then the light of
+/// both sides.
+fn ground(profile: &[f32]) -> (f32, f32, f32, f32) {
+    let (left, right) = (side(&profile[..SIDE]), side(&profile[profile.len() - SIDE..]));
+    // The sides' middles are `SIDE` samples less apart than the profile is long.
+    let slope = (right - left) / (profile.len() - SIDE) as f32;
+    (left - slope * (SIDE as f32 - 1.0) / 2.0, slope, left, right)
 }
 
 /// Sums over whole lanes of samples, the first `first_d` samples from the place: light above `level_at` (at the place)

@@ -47,7 +47,7 @@ fn stripe(image: &Image, colour: LaserColour, line: LineDirection, options: &Spo
     let laser = Laser { colour, line, plane: Plane { normal: nalgebra::Vector3::x(), offset_mm: 100.0 } };
     let (mut finder, mut measurer) = stripe_stages(&laser, options);
     let seen = finder.see(image.yuv());
-    measurer.measure(seen, None)
+    measurer.measure(&seen, None)
 }
 
 fn largest_error(stripe: &Stripe, start: f64) -> f64 {
