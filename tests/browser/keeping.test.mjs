@@ -184,29 +184,69 @@ test("another site's page that is open in the same browser can do nothing", asyn
 
 });
 
-test("rules of keeping say beforehand what goes; what is pinned stays", async () => {
+test("rules of keeping say beforehand what goes, are stored for every server, and given up again; what is pinned stays", async () => {
   const { page, close } = await openPage(browser, open);
   await page.goto("/settings/retention");
-  const own = page.getByRole("region", { name: "Rules of this server" });
-  await own.getByText("more than 3,650 days ago").waitFor();
-  await own.getByText("more than 500 GB").waitFor();
-  await own.getByText("Nothing would be deleted.").waitFor();
-  const tried = page.getByRole("region", { name: "Try other rules" });
-  await tried.getByLabel("Keep for, days").fill("many");
-  await tried.getByText("Expected a number of 0 or more.").waitFor();
-  await tried.getByLabel("Keep for, days").fill("0");
-  await tried.getByLabel("Store at most, GB").fill("100");
-  await tried.getByRole("button", { name: "Show what would go" }).click();
-  const bytes = await getJson(open, "/api/retention?keep_days=0");
-  assert.equal(bytes.runs, 2);
-  await tried.getByText(/^2 runs would be deleted/).waitFor();
-  await tried.getByText("stria serve --keep-days 0 --quota-gb 100").waitFor();
-  assert.deepEqual(await tried.getByRole("rowheader").allTextContents(), ["Old main", "New main"]);
-  await keepPicture(page, "retention-tried");
-  await tried.getByRole("button", { name: /^Pin the run of Old main/ }).click();
-  await tried.getByText(/^1 run would be deleted/).waitFor();
-  assert.deepEqual(await tried.getByRole("rowheader").allTextContents(), ["New main"]);
+  const held = page.getByRole("region", { name: "The rules that hold" });
+  await held.getByText("more than 3,650 days ago").waitFor();
+  await held.getByText("more than 500 GB").waitFor();
+  await held.getByText("this server's own settings, from how it was started").waitFor();
+  await held.getByText("Nothing would be deleted.").waitFor();
+  const other = page.getByRole("region", { name: "Other rules" });
+  const [days, gb, show, keep] = [other.getByLabel("Keep for, days"), other.getByLabel("Store at most, GB"), other.getByRole("button", { name: "Show what would go" }), other.getByRole("button", { name: "Keep by these rules" })];
+  assert.equal(await keep.count(), 0, "nothing is stored that nobody looked at");
+  await days.fill("many");
+  await other.getByText("Expected a number of 0 or more.").waitFor();
+  await days.fill("0");
+  await gb.fill("");
+  await show.click();
+  const preview = await getJson(open, "/api/retention?exactly=true&keep_days=0");
+  assert.equal(preview.runs, 2);
+  await other.getByText(/^2 runs would be deleted/).waitFor();
+  assert.ok(await keep.isDisabled(), "rules that keep nothing are not stored");
+  assert.deepEqual(await other.getByRole("rowheader").allTextContents(), ["Old main", "New main"]);
+  await other.getByRole("button", { name: /^Pin the run of Old main/ }).click();
+  await other.getByText(/^1 run would be deleted/).waitFor();
+  assert.deepEqual(await other.getByRole("rowheader").allTextContents(), ["New main"]);
   assert.equal((await getJson(open, `/api/runs/${runs[0].id}/pin`)).pinned, true);
+
+  // Less room than is taken: what would go is said, the fields no longer fit what was looked at, somebody else is faster.
+  await days.fill("");
+  await gb.fill("0.000001");
+  assert.equal(await keep.count(), 0);
+  await show.click();
+  await other.getByText(/^1 run would be deleted/).waitFor();
+  await keepPicture(page, "retention-tried");
+  await keep.click();
+  const dialog = other.getByRole("dialog");
+  await dialog.getByRole("heading", { name: /^Delete 1 run/ }).waitFor();
+  await keepPicture(page, "retention-asked");
+  await dialog.getByRole("button", { name: "Leave it as it is" }).click();
+  await days.fill("400");
+  await gb.fill("");
+  await show.click();
+  const put = (rules) => fetch(new URL("/api/retention", open.url), { method: "PUT", headers: { "content-type": "application/json" }, body: JSON.stringify(rules) });
+  assert.equal((await put({ keep_days: 700 })).status, 200);
+  await keep.click();
+  await dialog.getByRole("button", { name: "Keep by them" }).click();
+  await dialog.getByRole("alert").getByText("Somebody else has changed it").waitFor();
+  await held.getByText("more than 700 days ago").waitFor();
+  await dialog.getByRole("button", { name: "Keep by them" }).click();
+  await held.getByText("more than 400 days ago").waitFor();
+  await held.getByText(/^They were stored by anyone and hold on every server/).waitFor();
+  await other.getByText("These rules hold now.").waitFor();
+  const { rules } = await getJson(open, "/api/retention");
+  assert.deepEqual([rules.origin, rules.keep_days, rules.quota_gb ?? null, rules.own_keep_days], ["stored", 400, null, 3650]);
+  await keepPicture(page, "retention-stored");
+
+  await held.getByRole("button", { name: "Use the server's own settings again" }).click();
+  await held.getByRole("dialog").getByText("more than 3,650 days ago").waitFor();
+  await held.getByRole("dialog").getByText("Nothing would be deleted.").waitFor();
+  await held.getByRole("dialog").getByRole("button", { name: "Use them" }).click();
+  await held.getByText(/own settings, from how they were started, hold again, by the word of anyone/).waitFor();
+  await held.getByText("more than 3,650 days ago").first().waitFor();
+  assert.equal((await getJson(open, "/api/retention")).rules.origin, "server");
+  assert.equal((await getJson(open, "/api/runs")).items.length, 2, "nothing went");
 
   await page.goto(`/runs/${runs[0].id}`);
   await page.getByText("Pinned: it is kept whatever the rules say.").waitFor();

@@ -86,13 +86,13 @@ export async function rigForOtherSize(rig, folder) {
  * Starts Chromium with a fresh profile; WebGL is drawn in software, so that it works on any machine. `plain`: without
  * WebGL, as Chromium itself runs where there is no graphics card: everything else is then drawn several times as fast.
  */
-export async function startBrowser({ plain = false } = {}) {
+export async function startBrowser({ plain = false, flags = [] } = {}) {
   need(chromiumPath, "run `make setup`, which installs Chromium, or set CHROMIUM_BIN");
   const quiet = ["--disable-quic", "--no-first-run", "--disable-background-networking", "--disable-component-update", "--disable-sync"];
   // A test looks at the memory of a tab, and at the clock: nothing may slow a page because nobody sees it.
   const awake = ["--disable-background-timer-throttling", "--disable-renderer-backgrounding", "--disable-backgrounding-occluded-windows"];
   const webgl = plain ? ["--disable-gpu"] : ["--use-gl=angle", "--use-angle=swiftshader", "--enable-unsafe-swiftshader"];
-  return chromium.launch({ executablePath: chromiumPath, args: ["--no-sandbox", ...quiet, ...awake, ...webgl] });
+  return chromium.launch({ executablePath: chromiumPath, args: ["--no-sandbox", ...quiet, ...awake, ...webgl, ...flags] });
 }
 
 /**

@@ -3,6 +3,7 @@
 import assert from "node:assert/strict";
 import { createHash } from "node:crypto";
 import { readFile, writeFile } from "node:fs/promises";
+import { connect, createServer } from "node:net";
 import path from "node:path";
 import { after, before, test } from "node:test";
 import { setTimeout as sleep } from "node:timers/promises";
@@ -47,15 +48,15 @@ const item = (page, name) => page.locator(".upload-item", { hasText: name });
 const sentBytes = async (page, name) => Number(await item(page, name).getByRole("progressbar").getAttribute("value"));
 
 /** The run that the server made of a file, once it has. */
-async function arrived(asset, count = 1) {
+async function arrived(asset, count = 1, at = server) {
   return until(`${count} of ${asset} arrived`, 60_000, async () => {
-    const { items } = await getJson(server, `/api/runs?asset=${encodeURIComponent(asset)}`);
+    const { items } = await getJson(at, `/api/runs?asset=${encodeURIComponent(asset)}`);
     return items.length === count && items;
   });
 }
 
-async function sameSource(entry, file) {
-  const source = Buffer.from(await (await fetch(new URL(entry.source.url, server.url))).arrayBuffer());
+async function sameSource(entry, file, at = server) {
+  const source = Buffer.from(await (await fetch(new URL(entry.source.url, at.url))).arrayBuffer());
   assert.deepEqual(createHash("sha256").update(source).digest("hex"), createHash("sha256").update(await readFile(file)).digest("hex"));
 }
 
@@ -159,7 +160,11 @@ test("a reload in the middle: the same file again goes on where it stopped", asy
   await page.reload();
   await item(page, "big.mp4").getByText("Was interrupted").waitFor();
   const offsets = [];
-  page.on("request", (request) => request.method() === "PATCH" && offsets.push(Number(request.headers()["upload-offset"])));
+  page.on("request", (request) => {
+    if (request.method() !== "PATCH") return;
+    offsets.push(Number(request.headers()["upload-offset"]));
+    assert.match(request.headers()["upload-checksum"] ?? "none", /^sha256 /);
+  });
   await link.send("Network.emulateNetworkConditions", { offline: false, latency: 0, downloadThroughput: -1, uploadThroughput: -1 });
   await page.getByLabel("Choose files").setInputFiles([big]);
   const [entry] = await arrived("after a reload");
@@ -168,11 +173,37 @@ test("a reload in the middle: the same file again goes on where it stopped", asy
   await close();
 });
 
+test("a piece that the way spoils is refused and sent again, also where the browser lends the page no checksums", async () => {
+  // A name of a site's network without HTTPS: no secure context. Some proxy is trusted, so that the server answers to any name.
+  const [site, guest] = await Promise.all([startServer(["--workers", "0", "--trusted-proxy", "192.0.2.1"]), startBrowser({ flags: ["--host-resolver-rules=MAP site.test 127.0.0.1"] })]);
+  const way = await throughSpoilingWay(site);
+  const { page, close } = await openPage(guest, way);
+  const pieces = [];
+  page.on("response", async (response) => {
+    const request = response.request();
+    if (request.method() === "PATCH") pieces.push([response.status(), request.headers()["upload-checksum"] ?? "none"]);
+  });
+  await choose(page, [big, run.rig], "by a bad way");
+  assert.equal(await page.evaluate(() => "subtle" in crypto), false);
+  await item(page, "big.mp4").getByText("Has arrived").waitFor({ timeout: 60_000 });
+  const [entry] = await arrived("by a bad way", 1, site);
+  await sameSource(entry, big, site);
+  assert.ok(way.spoilt(), "a byte became another on the way");
+  assert.equal(pieces.filter(([status]) => status === 460).length, 1, JSON.stringify(pieces));
+  assert.ok(pieces.every(([, checksum]) => /^sha256 [\w+/]{43}=$/.test(checksum)), JSON.stringify(pieces));
+  assert.equal(pieces.at(-1)[0], 204);
+  await close();
+  way.stop();
+  await guest.close();
+  await site.stop();
+});
+
 test("from the empty form to the result by keyboard alone", async () => {
   const { page, close } = await openPage(browser, server);
   await page.goto("/send");
-  await tabTo(page, "Choose files");
+  // Asked for before the way there: the browser must know of it when the key comes.
   const chooser = page.waitForEvent("filechooser");
+  await tabTo(page, "Choose files");
   await page.keyboard.press("Space");
   await (await chooser).setFiles([run.video, run.rig]);
   await page.getByRole("button", { name: "Send the run" }).waitFor();
@@ -195,6 +226,34 @@ test("from the empty form to the result by keyboard alone", async () => {
   assert.match((await download).url(), /depth\.tif$/);
   await close();
 });
+
+/** The same server by a way on which one byte becomes another, once: in the middle of the first large packet that goes to the server. */
+async function throughSpoilingWay(server) {
+  let spoilt = false;
+  const ends = new Set();
+  const way = createServer((near) => {
+    const far = connect(new URL(server.url).port, "127.0.0.1");
+    for (const end of [near, far]) {
+      ends.add(end);
+      end.on("error", () => [near, far].forEach((each) => each.destroy()));
+    }
+    near.on("data", (packet) => {
+      if (!spoilt && packet.length > 16_000) {
+        packet[packet.length >> 1] ^= 1;
+        spoilt = true;
+      }
+      far.write(packet);
+    });
+    near.on("end", () => far.end());
+    far.pipe(near);
+  });
+  await new Promise((done) => way.listen(0, "127.0.0.1", done));
+  const stop = () => {
+    ends.forEach((end) => end.destroy());
+    way.close();
+  };
+  return { url: `http://site.test:${way.address().port}`, spoilt: () => spoilt, stop };
+}
 
 /** Presses Tab until the focus is on the named control. */
 async function tabTo(page, name) {

@@ -20,6 +20,8 @@ const SURFACE_SHARE = 0.02;
 const SURFACE_TIMES = 5;
 /** Share of the viewer's canvas that the pictures in an archive must make. */
 const PICTURES_SHARE = 0.1;
+/** And what its surface must make of it: the view of the space is a part of the layout, and seen from afar. */
+const CLOUD_SHARE = 0.005;
 
 let server, browser;
 
@@ -75,6 +77,11 @@ test("a finished run: the surface is on the canvas, and its pixels are the surfa
   const bare = await keepPicture(page.locator(".view").first(), "view3d-archive-without-pictures");
   const share = await differenceOf(page, shown, bare);
   assert.ok(share > PICTURES_SHARE, `share of the view that the archive's pictures make: ${share}`);
+  // In rerun's own layout the surface stands in the view of the space.
+  await show(await without(["/surface", "/surface/overview", "/profile"], converted));
+  const flat = await keepPicture(page.locator(".view").first(), "view3d-archive-without-surface");
+  const cloudShare = await differenceOf(page, shown, flat);
+  assert.ok(cloudShare > CLOUD_SHARE, `share of the view that the archive's surface makes: ${cloudShare}`);
   await run.remove();
   await close();
 });
@@ -96,6 +103,39 @@ test("a run that is being measured: the surface is on the canvas before the job 
   await keepPicture(page.locator(".view").first(), "view3d-live");
   await robot.stop();
   await page.getByText("The whole recording is shown").waitFor({ timeout: DONE_MS });
+  await run.remove();
+  await close();
+});
+
+test("a long run has a recording of each stretch: one is chosen by chainage, the address keeps it, only it is loaded", async () => {
+  const run = await simulate({ seconds: 3 });
+  const recipe = "[recording]\nbudget_mb = 5.0\nstretch_m = 0.15\nimages_per_s = 240.0\npoints_per_profile = 8192\n";
+  const sent = await sendRun(server, run, { asset: "long main", recipe, chainage_mm: "500", direction: "backward" });
+  await jobEnds(server, sent.job.id);
+  const { recordings } = await getJson(server, `/api/jobs/${sent.job.id}/products/manifest.json`);
+  assert.ok(recordings.length >= 3, "the recipe makes this run a long one");
+  const { page, close } = await openPage(browser, server);
+  const asked = [];
+  page.on("request", (request) => asked.push(new URL(request.url()).pathname.split("/").at(-1)));
+  await page.goto(`/runs/${sent.id}?tab=space&stretch=2`);
+  const choice = page.getByLabel("Part of the run");
+  await choice.waitFor();
+  assert.equal(await choice.locator("option").count(), recordings.length + 1);
+  // The chainage falls along this run.
+  const ends = [500 - recordings[1].to_x_mm, 500 - recordings[1].from_x_mm].map((mm) => `${Math.round(mm)}\u00a0mm`);
+  assert.equal(await choice.locator("option:checked").textContent(), ends.join(" to "));
+  await page.getByRole("button", { name: "Open 3D view" }).click();
+  await page.getByText("This part of the run is shown, with every step.").waitFor({ timeout: SHOWN_MS });
+  assert.deepEqual(asked.filter((name) => name.endsWith(".rrd") || name === "recording"), [recordings[1].name]);
+  await choice.selectOption({ index: 3 });
+  await page.getByText("This part of the run is shown, with every step.").waitFor({ timeout: SHOWN_MS });
+  await until("the third is loaded", 10_000, async () => asked.includes(recordings[2].name));
+  assert.match(page.url(), /[?&]stretch=3/);
+  await page.reload();
+  await choice.waitFor();
+  assert.equal(await choice.inputValue(), "3");
+  await choice.selectOption({ label: "The whole run, thinned out" });
+  assert.ok(!page.url().includes("stretch"));
   await run.remove();
   await close();
 });

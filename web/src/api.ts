@@ -29,6 +29,7 @@ export type Scope = Schemas["Scope"];
 export type Token = Schemas["Token"];
 export type TokenWithSecret = Schemas["TokenWithSecret"];
 export type RetentionPreview = Schemas["RetentionPreview"];
+export type RetentionRules = Schemas["RetentionRules"];
 export type Batch = Schemas["Batch"];
 export type BatchWish = Schemas["BatchWish"];
 export type BatchResult = Schemas["BatchResult"];
@@ -53,9 +54,17 @@ export interface Manifest {
     coverage: number;
     travel_mm: number;
     duration_s: number;
+    /** What older jobs did not write down. */
+    breaks?: number;
+    frames_3_dof?: number;
+    residual_px?: number | null;
+    /** One standard deviation of the last place against the first; none where the way was broken or given. */
+    drift?: { x_mm: number; y_mm: number; z_mm: number } | null;
   };
   resolution: { distance_mm: number; r_depth_mm: number } | null;
   gaps: { first_frame: number; last_frame: number; reason: string }[];
+  /** Dense recordings of stretches of a long run, by the camera's way. */
+  recordings?: { name: string; from_x_mm: number; to_x_mm: number }[];
 }
 
 /** What the server answered when it refused, or what kept us from reaching it. */
@@ -188,14 +197,26 @@ export function listDefects(filter: Partial<DefectFilter> & { job?: string }, cu
 export const defectsFile = (format: "csv" | "geojson", filter: Partial<DefectFilter>): string => `/api/defects.${format}?${defectQuery(filter)}`;
 export const getDefect = (defect: string): Promise<Defect> => json(`/api/defects/${at(defect)}`);
 export const getDefectHistory = (defect: string): Promise<DefectHistory> => json(`/api/defects/${at(defect)}/history`);
-export const changeDefect = (defect: string, change: DefectChange): Promise<Defect> =>
-  json(`/api/defects/${at(defect)}`, { method: "PATCH", headers: { "content-type": "application/json" }, body: JSON.stringify(change) });
+
+/** What a change was made from: where it has another version by now, the server changes nothing and answers with this status. */
+export const CHANGED_MEANWHILE = 412;
+const changing = (method: "PATCH" | "PUT" | "DELETE", version: string, body?: unknown): RequestInit => ({
+  method,
+  headers: { "if-match": `"${version}"`, ...(body === undefined ? {} : { "content-type": "application/json" }) },
+  ...(body === undefined ? {} : { body: JSON.stringify(body) }),
+});
+
+/** Changes what people say about a defect where it still is what it was. */
+export const changeDefect = ({ id, version }: Defect, change: DefectChange): Promise<Defect> => json(`/api/defects/${at(id)}`, changing("PATCH", version, change));
 
 /** What changed between two jobs; null while the server works it out. */
 export async function getChange(before: string, after: string): Promise<ChangeReport | null> {
   const response = await request(`/api/jobs/${at(after)}/change?before=${at(before)}`);
   return response.status === 202 ? null : ((await response.json()) as ChangeReport);
 }
+
+/** Where the map of that change lies. */
+export const differenceFile = (before: string, after: string): string => `/api/jobs/${at(after)}/change/difference.tif?before=${at(before)}`;
 
 /** What we read of a job's `defects.json`: what it could have seen. */
 export interface DefectListFile {
@@ -245,11 +266,19 @@ export const createToken = (wish: Schemas["TokenWish"]): Promise<TokenWithSecret
 export const rotateToken = (token: string, overlap_s: number): Promise<TokenWithSecret> => json(`/api/tokens/${at(token)}/rotate`, creating({ overlap_s }));
 export const revokeToken = (token: string): Promise<Token> => json(`/api/tokens/${at(token)}`, { method: "DELETE" });
 
-/** What the server's rules, or others, would delete now. */
-export function previewRetention(rules: { keep_days?: number; quota_gb?: number }): Promise<RetentionPreview> {
+/** Rules of keeping; what is not said does not matter. */
+export type KeepingRules = { keep_days?: number; quota_gb?: number };
+/** The rules that hold, and what they would delete now. */
+export const getRetention = (): Promise<RetentionPreview> => json("/api/retention");
+/** What these rules alone would delete now. */
+export function previewRetention(rules: KeepingRules): Promise<RetentionPreview> {
   const query = new URLSearchParams(Object.entries(rules).map(([name, value]) => [name, `${value}`]));
-  return json(`/api/retention?${query}`);
+  return json(`/api/retention?exactly=true&${query}`);
 }
+/** Makes rules hold on every server, where those that hold are still of this version. */
+export const storeRetention = (rules: KeepingRules, version: string): Promise<RetentionPreview> => json("/api/retention", changing("PUT", version, rules));
+/** Lets the servers' own settings hold again. */
+export const forgetRetention = (version: string): Promise<RetentionPreview> => json("/api/retention", changing("DELETE", version));
 
 /** The first jobs of a state, the newest first. */
 export const listJobsIn = (state: JobState, limit: number): Promise<JobPage> => json(`/api/jobs?state=${state}&limit=${limit}`);
@@ -275,7 +304,7 @@ const runPath = (run: string): string => `/api/runs/${at(run)}`;
 
 /** Changes a run where it still is what it was. */
 export const changeRun = ({ id, version }: Run, change: RunChange): Promise<Run> =>
-  json(runPath(id), { method: "PATCH", headers: { "content-type": "application/json", "if-match": `"${version}"` }, body: JSON.stringify(change) });
+  json(runPath(id), changing("PATCH", version, change));
 
 /** A pinned run is kept whatever the rules say. */
 export const isPinned = async (run: string): Promise<boolean> => (await json<Schemas["Pin"]>(`${runPath(run)}/pin`)).pinned;

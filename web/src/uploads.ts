@@ -4,8 +4,9 @@
 // the addresses of unfinished uploads: choosing the same file again goes on where it stopped.
 
 import { useEffect, useState } from "preact/hooks";
-import type { PreviousUpload, Upload as TusUpload } from "tus-js-client";
+import type { HttpRequest, PreviousUpload, Upload as TusUpload } from "tus-js-client";
 import { problemIn, problemOf, UNREACHABLE, type Problem } from "./api.ts";
+import { checksumOf } from "./digest.ts";
 import { heardOfSession, onSession } from "./session.ts";
 
 /** What is said about a run when it is sent. */
@@ -45,6 +46,15 @@ const STALLED_MS = 20_000;
 const LOOK_MS = 5000;
 /** Nobody is logged in any more: what arrived stays, and it goes on when somebody is. */
 const UNAUTHORIZED = 401;
+/** A piece arrived as other bytes than were sent. */
+const OTHER_BYTES = 460;
+/** So often in a row: then it is not the way that spoils it. */
+const MOST_SPOILT = 5;
+/**
+ * Each piece goes with its checksum, and counts as a whole: it takes some seconds on the link as it is, so that a cut costs no more
+ * than those, and between two pieces little time is lost. Bytes.
+ */
+const [PIECE_S, LEAST_PIECE, FIRST_PIECE, MOST_PIECE] = [3, 64 * 1024, 256 * 1024, 16 * 1024 * 1024];
 
 interface Entry extends Item {
   file: File | null;
@@ -54,6 +64,12 @@ interface Entry extends Item {
   marks: { at: number; sent: number }[];
   /** When the last byte went out, ms since the page began. */
   movedMs: number;
+  /** Grows whenever it is stopped: what was prepared before is not sent any more. */
+  turn: number;
+  /** When the piece on its way began, ms since the page began. */
+  pieceMs: number;
+  /** Pieces in a row that arrived as other bytes. */
+  spoilt: number;
 }
 
 let entries: Entry[] = [];
@@ -99,7 +115,7 @@ export function sendFiles(files: File[], fields: UploadFields): void {
 function empty(name: string, bytes: number): Entry {
   const id = nextId;
   nextId += 1;
-  return { id, name, bytes, sent: 0, state: "waiting", bytes_per_s: 0, asset: "", problem: null, run: null, file: null, fields: null, tus: null, previous: null, marks: [], movedMs: 0 };
+  return { id, name, bytes, sent: 0, state: "waiting", bytes_per_s: 0, asset: "", problem: null, run: null, file: null, fields: null, tus: null, previous: null, marks: [], movedMs: 0, turn: 0, pieceMs: 0, spoilt: 0 };
 }
 
 function find(id: number): Entry | undefined {
@@ -109,7 +125,7 @@ function find(id: number): Entry | undefined {
 export function pause(id: number): void {
   const entry = find(id);
   if (!entry || entry.state === "sent" || entry.state === "refused") return;
-  void entry.tus?.abort();
+  stop(entry);
   update(entry, { state: "paused", bytes_per_s: 0, marks: [] });
   next();
 }
@@ -128,6 +144,7 @@ export async function discard(id: number): Promise<void> {
   changed();
   next();
   if (entry.state === "sent") return;
+  entry.turn += 1;
   try {
     if (entry.tus) await entry.tus.abort(true);
     else if (entry.previous?.uploadUrl) await (await import("tus-js-client")).Upload.terminate(entry.previous.uploadUrl);
@@ -179,10 +196,18 @@ function make(tus: typeof import("tus-js-client"), entry: Entry, file: File): Tu
     metadata,
     retryDelays: [...RETRY_MS, ...Array.from({ length: 500 }, () => RETRY_MS.at(-1)!)],
     removeFingerprintOnSuccess: true,
+    chunkSize: FIRST_PIECE,
+    onBeforeRequest: (request) => withChecksum(entry, upload, file, request),
+    onChunkComplete: (bytes) => {
+      entry.spoilt = 0;
+      const seconds = Math.max((performance.now() - entry.pieceMs) / 1000, 0.001);
+      upload.options.chunkSize = Math.round(Math.min(Math.max((bytes / seconds) * PIECE_S, LEAST_PIECE), MOST_PIECE));
+    },
     onShouldRetry: (error) => {
       const status = error.originalResponse?.getStatus() ?? 0;
+      if (status === OTHER_BYTES) entry.spoilt += 1;
       // No answer, a busy server, another connection still at it: the cut is not the file's fault.
-      const again = status === 0 || status >= 500 || status === 409 || status === 423 || status === 429 || status === 408;
+      const again = status === 0 || status >= 500 || status === 409 || status === 423 || status === 429 || status === 408 || (status === OTHER_BYTES && entry.spoilt < MOST_SPOILT);
       if (again && entry.state === "sending") update(entry, { state: "cut", bytes_per_s: 0, marks: [] });
       return again && entry.state !== "paused";
     },
@@ -205,6 +230,18 @@ function make(tus: typeof import("tus-js-client"), entry: Entry, file: File): Tu
     },
   });
   return upload;
+}
+
+/** Says with a piece what its bytes are, so that the server takes no others. Without one it goes all the same. */
+async function withChecksum(entry: Entry, upload: TusUpload, file: File, request: HttpRequest): Promise<void> {
+  const offset = Number(request.getHeader("Upload-Offset"));
+  if (request.getMethod() !== "PATCH" || !Number.isFinite(offset)) return;
+  const turn = entry.turn;
+  const checksum = await checksumOf(file.slice(offset, Math.min(offset + (upload.options.chunkSize ?? file.size), file.size)));
+  // Stopped meanwhile: tus would send it all the same, beside what comes next.
+  if (turn !== entry.turn) return new Promise(() => undefined);
+  entry.pieceMs = performance.now();
+  if (checksum !== null) request.setHeader("Upload-Checksum", checksum);
 }
 
 function rate(entry: Entry, sent: number): number {
@@ -251,8 +288,13 @@ addEventListener("beforeunload", (event) => {
 
 /** Lets go of a connection that is dead; what arrived stays. */
 function cut(entry: Entry): void {
-  void entry.tus?.abort();
+  stop(entry);
   update(entry, { state: "cut", bytes_per_s: 0, marks: [] });
+}
+
+function stop(entry: Entry): void {
+  entry.turn += 1;
+  void entry.tus?.abort();
 }
 
 /** Takes up what was cut. */

@@ -244,7 +244,7 @@ function drawRulers(context: CanvasRenderingContext2D, view: View, size: Size, {
   context.lineWidth = 1;
   context.beginPath();
 
-  const step = roundDown(160 * scale);
+  const step = roundDown(Math.min(160, size.width / 3) * scale);
   const box = visible(view, size);
   const ends = [start_mm + sign * box.left, start_mm + sign * box.right] as const;
   context.textAlign = "left";

@@ -1,6 +1,6 @@
 // What changed on the wall between two measurements: a table, and the numbers on both maps.
 
-import { getChange, type ChangeReport } from "../api.ts";
+import { differenceFile, getChange, type ChangeReport } from "../api.ts";
 import { useLoaded, type Loaded } from "../hooks.ts";
 import type { Marker } from "../map/painter.ts";
 import type { Place } from "../map/pyramid.ts";
@@ -16,9 +16,10 @@ export function useChange(before: string, after: string): Loaded<{ report: Chang
   return useLoaded(`change ${before} ${after}`, async () => ({ report: await getChange(before, after) }), ({ report }) => (report === null ? AGAIN_MS : null));
 }
 
-/** Where the changes are on a map that lies shifted to the earlier one. */
-export function changeMarkers(report: ChangeReport, shift: Place): Marker[] {
-  return report.changes.map(({ id, x_mm, y_mm, state }) => ({ number: id, x_mm: x_mm + shift.x_mm, y_mm: y_mm + shift.y_mm, colour: state === "shrunk" || state === "vanished" ? "--minor" : "--severe", chosen: false }));
+/** Where the changes are on a map that lies shifted to the earlier one, and with `turned` half about. */
+export function changeMarkers(report: ChangeReport, shift: Place, turned: boolean): Marker[] {
+  const sign = turned ? -1 : 1;
+  return report.changes.map(({ id, x_mm, y_mm, state }) => ({ number: id, x_mm: sign * (x_mm + shift.x_mm), y_mm: sign * (y_mm + shift.y_mm), colour: state === "shrunk" || state === "vanished" ? "--minor" : "--severe", chosen: false }));
 }
 
 export function ChangePanel({ change }: { change: Loaded<{ report: ChangeReport | null }> }) {
@@ -87,6 +88,11 @@ function Report({ report }: { report: ChangeReport }) {
           </table>
         </div>
       )}
+      <p>
+        <a class="button small" href={differenceFile(report.before, report.after)} download="difference.tif" title={words.differenceHint}>
+          {words.difference}
+        </a>
+      </p>
       {unsure_before.length + unsure_after.length > 0 && <p class="faint">{words.unsure(unsure_before.length, unsure_after.length)}</p>}
     </>
   );

@@ -1,7 +1,7 @@
 // One defect: its figures, what people decide about it, the same place in other runs.
 
 import { useEffect, useId, useRef, useState } from "preact/hooks";
-import { changeDefect, getDefectHistory, type Defect, type DefectChange, type DefectHistory, type DefectState } from "../api.ts";
+import { CHANGED_MEANWHILE, changeDefect, getDefect, getDefectHistory, problemOf, type Defect, type DefectChange, type DefectHistory, type DefectState } from "../api.ts";
 import { once, useLoaded } from "../hooks.ts";
 import { defectPath, Link } from "../router.tsx";
 import { texts } from "../texts.ts";
@@ -74,10 +74,21 @@ function Judge({ defect, onChanged }: Omit<Props, "onClose">) {
   const [saved, setSaved] = useState(false);
   const changed = state !== defect.state || comment !== defect.comment;
   const save = async (change: DefectChange) => {
-    const now = await changeDefect(defect.id, { ...change, version: defect.version });
-    setState(now.state);
-    setSaved(true);
-    onChanged(now);
+    try {
+      const now = await changeDefect(defect, change);
+      setState(now.state);
+      setSaved(true);
+      onChanged(now);
+    } catch (error) {
+      if (problemOf(error).status === CHANGED_MEANWHILE) {
+        // What somebody else said stands in the form now: whoever still wants something else says it again.
+        const theirs = await getDefect(defect.id);
+        setState(theirs.state);
+        setComment(theirs.comment);
+        onChanged(theirs);
+      }
+      throw error;
+    }
   };
   return (
     <section>

@@ -72,7 +72,7 @@ function Numbered({ run, job, defects: given }: { run: Run; job: Job; defects: D
   };
   return (
     <>
-      <div class="segments" role="radiogroup" aria-label={words.layers}>
+      <div class="segments layer-choice" role="radiogroup" aria-label={words.layers}>
         {LAYERS.map((each) => (
           <label key={each} class={each === layer ? "on" : ""}>
             <input

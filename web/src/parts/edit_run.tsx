@@ -1,7 +1,7 @@
 // What is said about a run, to be set right: its asset, where it begins, which way, when, and a note. And a pin.
 
 import { useId, useRef, useState } from "preact/hooks";
-import { changeRun, getRun, isPinned, listAssets, problemOf, setPinned, type Problem, type Run, type RunChange } from "../api.ts";
+import { CHANGED_MEANWHILE, changeRun, getRun, isPinned, listAssets, problemOf, setPinned, type Problem, type Run, type RunChange } from "../api.ts";
 import { once, useLoaded } from "../hooks.ts";
 import { runTexts } from "../texts/run.ts";
 import { uploadTexts } from "../texts/upload.ts";
@@ -10,7 +10,6 @@ import { Field } from "./field.tsx";
 import { ProblemBox } from "./problem.tsx";
 
 const words = runTexts.edit;
-const CHANGED_MEANWHILE = 412;
 
 /** What the form holds; times are local, as such a form has them. */
 interface Values {

@@ -1,7 +1,7 @@
 // The 3D view: the rerun viewer on a canvas, opened on request, fed with the job's recording while it grows.
 
 import { useEffect, useRef, useState } from "preact/hooks";
-import { getBytes, getRecording, isActive, problemOf, type Job, type Problem } from "../api.ts";
+import { getBytes, getRecording, isActive, problemOf, productPath, type Job, type Problem } from "../api.ts";
 import { runTexts } from "../texts/run.ts";
 import { startViewer, viewerRuns, type Viewer } from "../viewer.ts";
 import { ProblemBox } from "./problem.tsx";
@@ -12,7 +12,13 @@ const words = runTexts.view;
 const POLL_MS = 2000;
 const PANIC_CHECK_MS = 2000;
 
-type Props = { job: Job; segments: number; name: string };
+type Props = {
+  job: Job;
+  segments: number;
+  name: string;
+  /** The recording of one stretch of a long run, by its file's name; null: that of the whole. */
+  stretch: string | null;
+};
 
 export function View3d(props: Props) {
   const [open, setOpen] = useState(false);
@@ -32,7 +38,7 @@ export function View3d(props: Props) {
           </p>
         </>
       )}
-      {open && <OpenView {...props} onClose={() => setOpen(false)} />}
+      {open && <OpenView key={props.stretch} {...props} onClose={() => setOpen(false)} />}
     </section>
   );
 }
@@ -41,9 +47,10 @@ type Phase =
   | { is: "loading"; loadedBytes: number; totalBytes: number | null }
   | { is: "starting" }
   | { is: "showing"; parts: number; complete: boolean }
+  | { is: "stretch" }
   | { is: "crashed" };
 
-function OpenView({ job, segments, name, onClose }: Props & { onClose: () => void }) {
+function OpenView({ job, segments, name, stretch, onClose }: Props & { onClose: () => void }) {
   const canvas = useRef<HTMLCanvasElement>(null);
   const closeButton = useRef<HTMLButtonElement>(null);
   const wake = useRef<() => void>(() => undefined);
@@ -66,7 +73,13 @@ function OpenView({ job, segments, name, onClose }: Props & { onClose: () => voi
         wake.current = go;
         setTimeout(go, POLL_MS);
       });
-      await feed(viewer, job.id, stopped.signal, woken, (parts, complete) => setPhase({ is: "showing", parts, complete }));
+      const progress = (parts: number, complete: boolean) => setPhase({ is: "showing", parts, complete });
+      if (stretch === null) return feed(viewer, job.id, stopped.signal, woken, progress);
+      progress(0, false);
+      const bytes = await getBytes(productPath(job.id, stretch));
+      if (stopped.signal.aborted || viewer.failure() !== null) return;
+      viewer.send(bytes);
+      setPhase({ is: "stretch" });
     };
     run().catch((error: unknown) => {
       if (!stopped.signal.aborted) setProblem(problemOf(error));
@@ -113,6 +126,8 @@ function phaseInWords(phase: Phase): string {
       return words.starting;
     case "crashed":
       return words.crashed;
+    case "stretch":
+      return words.stretchShown;
     case "showing":
       if (phase.complete) return phase.parts === 0 ? words.none : words.whole(phase.parts);
       return phase.parts === 0 ? words.waiting : words.live(phase.parts);

@@ -35,7 +35,7 @@ export function RecipesSettings() {
         </label>
       </div>
       <div class="table-box card" tabIndex={0} role="region" aria-label={words.option}>
-        <table class="plain-table">
+        <table class="plain-table options">
           <thead>
             <tr>
               <th scope="col">{words.option}</th>
@@ -57,7 +57,7 @@ export function RecipesSettings() {
                 {values.map((each, at) => {
                   const value = each.get(option.key) ?? tomlOf(option.default);
                   return (
-                    <td key={at} class={value === tomlOf(option.default) || Number(value) === option.default ? "" : "changed"}>
+                    <td key={at} data-recipe={recipes[at]?.name} class={value === tomlOf(option.default) || Number(value) === option.default ? "" : "changed"}>
                       {value.replaceAll('"', "")}
                     </td>
                   );

@@ -63,7 +63,8 @@ function crossingOf(rig: Geometry, size: number, reach: number): [number, number
   return near < reach && far > 0 ? [near, Math.min(far, reach)] : null;
 }
 
+/** A round step, not below a value: no more marks than have room for their words. */
 function roundStep(value: number): number {
   const power = 10 ** Math.floor(Math.log10(value));
-  return [5, 2, 1].map((digit) => digit * power).find((step) => step <= value) ?? power;
+  return [1, 2, 5].map((digit) => digit * power).find((step) => step >= value) ?? 10 * power;
 }

@@ -95,7 +95,7 @@ export const defectTexts = {
   carried: "This was said of the same place in an earlier measurement of this run.",
   gone: "This defect does not exist any more.",
   history: "The same place in other runs",
-  historyAlone: "No other run of this asset has passed this place in this direction.",
+  historyAlone: "No other run of this asset has passed this place.",
   historyRun: "Run of",
   historyDepth: "Depth",
   historyNothing: (limit_mm: number) => `nothing found (a dent of 20 mm radius shows from ${lengthMm(limit_mm)} on)`,
@@ -135,6 +135,8 @@ export const defectTexts = {
     about: (lod_mm: number, claimed_mm: number) =>
       `Left is before, right is after. 95 % of an unchanged surface differs by less than ${lengthMm(lod_mm)}; a change is claimed from ${lengthMm(claimed_mm)} on.`,
     none: "No change that could be told.",
+    difference: "Map of the difference (GeoTIFF)",
+    differenceHint: "After less before in millimetres, in the place of the run before",
     states: { new: "New", grown: "Grown", shrunk: "Shrunk", vanished: "Vanished", changed: "Changed, no defect in either", unchanged: "Unchanged" } as Record<string, string>,
     state: "What",
     before: "Before",

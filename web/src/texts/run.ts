@@ -166,6 +166,7 @@ export const runTexts = {
     left: "Left",
     right: "Right",
     together: "Both maps move together.",
+    turned: "The two runs went opposite ways along the asset: the right map lies turned half about.",
     back: "Back to the run",
     onlyDone: "Two measurements can be compared once both are done.",
     figures: {
@@ -214,13 +215,18 @@ export const runTexts = {
     trackedAll: "Its motion was followed from the first frame to the last.",
     tracked: (followed: number, all: number) =>
       `Its motion was followed in ${count(followed)} of ${count(all)} steps; where it was lost, distances are too short.`,
+    breaks: (breaks: number) => `${breaks === 1 ? "Once" : `${count(breaks)} times`} it was lost for so long that the surface begins anew behind it: distances across such a place are not to be trusted.`,
+    fit: (px: number) => `Where the wall is seen again from frame to frame, it is met to ${number(px)} px.`,
+    drift: (alongMm: number, acrossMm: number, deepMm: number) =>
+      `From the first frame to the last, places may have drifted by ${lengthMm(alongMm)} along the way, ${lengthMm(acrossMm)} across it and ${lengthMm(deepMm)} in depth (one standard deviation). Dents and steps, which lie close together, are measured far more surely.`,
+    onlyPosition: (frames: number) => `In ${count(frames)} frames the wall showed too little to tell how the camera was turned: they count as not turned.`,
     coverage: (share: number) => `${percent(share)} of the map's area has a depth.`,
     points: (points: number) => `${count(points)} points were measured.`,
     resolution: (mm: number, distanceMm: number) =>
       `At the wall's distance of ${lengthMm(distanceMm)}, a shift of the line by one pixel means ${number(mm)} mm of depth.`,
     gaps: "Gaps",
     gapsMore: (more: number) => `…and ${count(more)} more.`,
-    gapReasons: { no_stripe: "no laser line seen", not_tracked: "motion not followed" } as Record<string, string>,
+    gapReasons: { no_stripe: "no laser line seen", not_tracked: "motion not followed", beyond_map: "beyond the map's limits" } as Record<string, string>,
     gap: (first: number, last: number, reason: string) =>
       `${first === last ? `Frame ${count(first)}` : `Frames ${count(first)} to ${count(last)}`}: ${runTexts.quality.gapReasons[reason] ?? reason}`,
     warnings: "Please note",
@@ -281,6 +287,11 @@ export const runTexts = {
     live: (parts: number) => `Live: ${parts === 1 ? "1 part" : `${count(parts)} parts`} received, more to come.`,
     whole: (parts: number) => `The whole recording is shown (${parts === 1 ? "1 part" : `${count(parts)} parts`}).`,
     none: "This job made no recording.",
+    stretch: "Part of the run",
+    stretchWhole: "The whole run, thinned out",
+    stretchOf: (from_mm: number, to_mm: number) => `${lengthMm(from_mm)} to ${lengthMm(to_mm)}`,
+    stretchHint: "A run as long as this has every step only in the recordings of its parts, by chainage.",
+    stretchShown: "This part of the run is shown, with every step.",
     canvas: "3D view of the measured surface and the steps of the method",
     keys: "Press Escape to leave the 3D view with the keyboard.",
     old: "This browser is too old for the 3D view. It needs Chrome or Edge 91, Firefox 89, Safari 16.4, or newer. Everything else on this page works.",

@@ -48,11 +48,13 @@ export function CompareView({ run: id, left, right }: { run: string; left: strin
 
 /** Both maps, and what changed from the one to the other. */
 function Maps({ runs, jobs }: { runs: Run[]; jobs: Job[] }) {
-  const link = useMemo(() => new ViewLink(), []);
+  // A run that went the other way shows the wall turned half about: its map moves alone.
+  const turned = runs[0]?.direction !== runs[1]?.direction;
+  const links = useMemo(() => (turned ? [new ViewLink(), new ViewLink()] : Array(2).fill(new ViewLink())) as ViewLink[], [turned]);
   const change = useChange(jobs[0]?.id ?? "", jobs[1]?.id ?? "");
   const report = change.value?.report ?? null;
   const shifts = useMemo(() => shiftsOf(runs, report), [runs, report]);
-  const markers = useMemo(() => shifts.map((shift) => (report === null ? [] : changeMarkers(report, shift))), [shifts, report]);
+  const markers = useMemo(() => shifts.map((shift, side) => (report === null ? [] : changeMarkers(report, shift, turned && side === 1))), [shifts, report, turned]);
   const two = runs[0]?.id !== runs[1]?.id;
   return (
     <>
@@ -64,12 +66,12 @@ function Maps({ runs, jobs }: { runs: Run[]; jobs: Job[] }) {
           return (
             <section key={`${side} ${job.id}`} class="card" aria-label={side === 0 ? words.left : words.right}>
               <h2 class="words">{two ? `${localTime(run.recorded_at)} · ${run.source.filename}` : name}</h2>
-              <MapPanel run={run} job={job} link={link} plain shift={shifts[side]!} markers={markers[side]!} label={`${side === 0 ? words.left : words.right}: ${name}`} />
+              <MapPanel run={run} job={job} link={links[side]!} plain shift={turned ? shifts[0]! : shifts[side]!} markers={markers[side]!} label={`${side === 0 ? words.left : words.right}: ${name}`} />
             </section>
           );
         })}
       </div>
-      <p class="faint">{words.together}</p>
+      <p class="faint">{turned ? words.turned : words.together}</p>
       <ChangePanel change={change} />
     </>
   );
@@ -94,7 +96,8 @@ type Pair = { jobs: Job[]; manifests: Manifest[] };
 
 function Outcome({ jobs, manifests }: Pair) {
   const value = (manifest: Manifest, figure: string) => {
-    const number = manifest.quality[figure as keyof Manifest["quality"]];
+    const found = manifest.quality[figure as keyof Manifest["quality"]];
+    const number = typeof found === "number" ? found : 0;
     if (figure === "rows_found" || figure === "coverage") return percent(number);
     return figure === "travel_mm" ? lengthMm(number) : count(number);
   };

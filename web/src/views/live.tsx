@@ -3,6 +3,7 @@
 import { useEffect, useState } from "preact/hooks";
 import { getLiveFrame, getRun, listJobsIn, type Job, type Run } from "../api.ts";
 import { useLoaded, useTitle } from "../hooks.ts";
+import { CommandLine } from "../parts/command_line.tsx";
 import { farInWords, JobBar } from "../parts/job_bar.tsx";
 import { ProblemBox } from "../parts/problem.tsx";
 import { State } from "../parts/state.tsx";
@@ -34,7 +35,7 @@ export function LiveView() {
       <p class="faint">{words.about}</p>
       {live.problem && <ProblemBox problem={live.problem} onRetry={live.reload} />}
       {live.value === null && !live.problem && <p role="status">{texts.waiting.list}</p>}
-      {live.value && live.value.running.length === 0 && <p class="empty">{words.none}</p>}
+      {live.value && live.value.running.length === 0 && <Empty />}
       <ul class="live-cards">
         {live.value?.running.map(({ job, run }) => (
           <li key={job.id} class="card live-card">
@@ -58,6 +59,25 @@ export function LiveView() {
         </p>
       )}
     </>
+  );
+}
+
+/** What to type for a stream. */
+const FFMPEG = (server: string) => `ffmpeg -f v4l2 -i /dev/video0 -f mpjpeg -method POST "${server}/api/live/robot7?asset=Pipe%207&rig=gr3"`;
+const ROBOT = (server: string) => `ffmpeg -f v4l2 -i /dev/video0 -f mpjpeg - | stria send - --live --stream robot7 --server ${server} --asset "Pipe 7" --rig gr3`;
+
+function Empty() {
+  return (
+    <section class="empty">
+      <p>{words.none}</p>
+      <p>{words.how}</p>
+      <CommandLine command={FFMPEG(location.origin)} />
+      <p>{words.howRobot}</p>
+      <CommandLine command={ROBOT(location.origin)} />
+      <p class="faint">
+        {words.howToken} <Link to="/settings/tokens">{words.tokens}</Link>
+      </p>
+    </section>
   );
 }
 

@@ -202,7 +202,7 @@ function RunRow({ run }: { run: Run }) {
           <span class="run-asset">{run.asset}</span> <span class="run-file">{filename}</span>
         </Link>
         <span class="faint run-about">
-          <Time at={run.recorded_at} /> · {texts.runs.at(lengthMm(run.chainage_mm))} · {size(bytes)}
+          <Time at={run.recorded_at} /> · {texts.runs.at(lengthMm(run.chainage_mm))} <span class="run-bytes">· {size(bytes)}</span>
         </span>
       </div>
       <div class="run-quality">
@@ -225,11 +225,10 @@ function Quality({ rows, travel_mm, points, warnings }: { rows: number; travel_m
   const grade = points === 0 || rows < FAIR_ROWS ? "poor" : rows < GOOD_ROWS ? "fair" : "good";
   return (
     <>
-      <span class={`grade ${grade}`}>{texts.runs.quality[grade]}</span>
-      <span class="faint">
-        {points === 0 ? texts.runs.nothingMeasured : `${texts.runs.travel(travel_mm)}, ${texts.runs.rows(rows)}`}
-        {warnings > 0 && ` · ${texts.runs.warnings(warnings)}`}
+      <span class="run-grade">
+        <span class={`grade ${grade}`}>{texts.runs.quality[grade]}</span> {warnings > 0 && <span class="warn-words">{texts.runs.warnings(warnings)}</span>}
       </span>
+      <span class="faint">{points === 0 ? texts.runs.nothingMeasured : `${texts.runs.travel(travel_mm)}, ${texts.runs.rows(rows)}`}</span>
     </>
   );
 }
