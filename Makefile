@@ -14,7 +14,7 @@ test: build
 bench: build
 	target/python/bin/python tests/bench/bench.py $(BENCH)
 
-# What the cloud of 30 minutes costs to hand on: size, time and memory of each export; and the size of archives.
+# What 30 minutes cost to hand on: size, time and memory of every export of a job and of a full HD cloud; size of archives.
 bench-exports: build
 	target/python/bin/python tests/bench/bench.py --skip speed,memory,accuracy $(BENCH)
 
@@ -31,8 +31,7 @@ bench-upload: build
 # The queue beside graphile_worker on one PostgreSQL; then its times beside 10,000 and 1,000,000 jobs.
 bench-queue: build
 	cd tests/bench/queue && npm ci --no-audit --no-fund
-	target/python/bin/python tests/bench/queue.py
-	cargo test --release --locked --workspace --bin stria -- --ignored --nocapture scale
+	target/python/bin/python tests/bench/bench_queue.py
 
 # Defects, sections and change between runs against the truth; DEFECTS="--quick" for three scenes.
 bench-defects: build

@@ -28,7 +28,7 @@ GROUPS = {
     "steps (cloud)": "step_cloud",
     "steps (map)": "step_map",
     "travel": ("travel_", "path_"),
-    "poses": ("position_", "rotation_", "frames_"),
+    "poses": ("position_", "rotation_", "frames_", "drift_"),
     "shift": ("dx_", "dy_"),
     "standstill": "still_",
     "revisited": "revisit_",
@@ -57,6 +57,7 @@ def evaluate(run: Run, products: Products) -> dict:
         figures |= measures.travel(run, products.trajectory)
         figures |= measures.pose_error(run, products.trajectory, alignment)
         figures |= measures.standstill(run, products.trajectory)
+        figures |= measures.drift(run, products.trajectory, products.manifest.get("quality", {}).get("drift"))
     if place := products.manifest.get("depth_map"):
         figures |= {"map_width_mm": place["width_px"] * place["mm_per_px"]}
         figures |= {"map_height_mm": place["height_px"] * place["mm_per_px"]}

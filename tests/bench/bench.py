@@ -7,15 +7,17 @@
 Simulates full HD runs with truth (kept in the work folder: the next run is quick), then prints as text and writes to
 WORK/bench.md (tables ready for the README) and WORK/bench.json (every figure):
 - speed: frames/s of bare decoding, of each method with few and with all products, and of the yardstick (the publication
-  in plain Python and OpenCV), in interleaved rounds; and the time per stage;
+  in plain Python and OpenCV), in interleaved rounds; the same of `metric` on a minute of video; and the time per stage;
 - memory: peak for 1 and for 10 minutes of video;
 - accuracy: both methods over all scenes against their truth;
-- exports: the archive's size; time, size and memory of a 30-minute run's cloud in each format.
+- exports: the archive's size; time, size and memory of a full HD run's cloud of 30 minutes in each format, and of every
+  export of a whole job of 30 minutes through a server.
 """
 
 import argparse
 import json
 import os
+import resource
 import shutil
 import statistics
 import subprocess
@@ -33,11 +35,21 @@ except ImportError as missing:
     sys.exit(f"{missing}: the bench needs tests/requirements.txt; `make setup` installs it into target/python")
 
 from bench_exports import exports, exports_table
+from bench_long_job import long_job_table
 from bench_runs import SCENES, Bench, BenchError, Scene, call, say
-from bench_tables import Table, accuracy_tables, memory_table, speed_table, stages_table
+from bench_tables import (
+    JITTER_SCENES,
+    Table,
+    accuracy_tables,
+    long_speed_table,
+    memory_table,
+    speed_table,
+    stages_table,
+)
 
 ROOT = Path(__file__).resolve().parents[2]
 SPEED_SCENES = ("pipe", "wall")
+LONG_S = 60
 MEMORY_SCENE = "wall"
 BUSY_SHARE = 0.1
 """Other programs that take more of the processor than this are mentioned."""
@@ -45,28 +57,73 @@ PARTS = ("speed", "memory", "accuracy", "exports")
 
 
 def speed(bench: Bench, scenes: list[Scene], methods: list[str], rounds: int) -> dict:
-    """Times in s of everything on each scene, round by round: name → {frames, all_s, median_s, timings_s}."""
+    """Times in s of everything on each scene, round by round: name → {frames, all_s, median_s, cpu_s, timings_s};
+    cpu_s: the median of what all cores together spent."""
     results = {}
     for scene in scenes:
         run = bench.run(scene)
         all_s: dict[str, list[float]] = {}
+        cpu_s: dict[str, list[float]] = {}
         timings_s: dict[str, dict] = {}
         for k in range(rounds):
             say(f"speed on {scene.name}, round {k + 1} of {rounds}")
-            begun = time.perf_counter()
+            begun, cpu_before_s = time.perf_counter(), children_cpu_s()
             call(["ffmpeg", "-v", "error", "-i", run / "video.mp4", "-f", "null", "-"], "ffmpeg")
             all_s.setdefault("decoding", []).append(time.perf_counter() - begun)
+            cpu_s.setdefault("decoding", []).append(children_cpu_s() - cpu_before_s)
             for method in methods:
                 for few, kind in ((True, "few"), (False, "all")):
+                    cpu_before_s = children_cpu_s()
                     out, seconds = bench.process(run, method, few)
                     all_s.setdefault(f"{method}, {kind}", []).append(seconds)
+                    cpu_s.setdefault(f"{method}, {kind}", []).append(children_cpu_s() - cpu_before_s)
                     timings_s[method] = json.loads((out / "manifest.json").read_text())["timings_s"]
                     shutil.rmtree(out)
             all_s.setdefault("yardstick", []).append(yardstick_s(bench, run))
-        median_s = {name: statistics.median(times) for name, times in all_s.items()}
-        frames = len(np.load(run / "truth" / "stripes.npy", mmap_mode="r"))
-        results[scene.name] = {"frames": frames, "all_s": all_s, "median_s": median_s, "timings_s": timings_s}
+        results[scene.name] = {
+            "frames": len(np.load(run / "truth" / "stripes.npy", mmap_mode="r")),
+            "all_s": all_s,
+            "median_s": {name: statistics.median(times) for name, times in all_s.items()},
+            "cpu_s": {name: statistics.median(times) for name, times in cpu_s.items()},
+            "timings_s": timings_s,
+        }
     return results
+
+
+def long_speed(bench: Bench, scenes: list[Scene], rounds: int) -> dict:
+    """As speed(), on a minute of video of each scene, without what takes minutes for it."""
+    results = {}
+    for scene in scenes:
+        run = bench.run(scene)
+        video = bench.long_video(run, LONG_S, straight=False)
+        all_s: dict[str, list[float]] = {}
+        cpu_s: dict[str, list[float]] = {}
+        for k in range(rounds):
+            say(f"speed on {LONG_S} s of {scene.name}, round {k + 1} of {rounds}")
+            for name, few in (("decoding", None), ("metric, few", True), ("metric, all", False)):
+                begun, cpu_before_s = time.perf_counter(), children_cpu_s()
+                if few is None:
+                    call(["ffmpeg", "-v", "error", "-i", video, "-f", "null", "-"], "ffmpeg")
+                else:
+                    out, _ = bench.process(run, "metric", few, video=video)
+                all_s.setdefault(name, []).append(time.perf_counter() - begun)
+                cpu_s.setdefault(name, []).append(children_cpu_s() - cpu_before_s)
+                if few is not None:
+                    frames = json.loads((out / "manifest.json").read_text())["quality"]["frames"]
+                    shutil.rmtree(out)
+        results[scene.name] = {
+            "frames": frames,
+            "all_s": all_s,
+            "median_s": {name: statistics.median(times) for name, times in all_s.items()},
+            "cpu_s": {name: statistics.median(times) for name, times in cpu_s.items()},
+        }
+    return results
+
+
+def children_cpu_s() -> float:
+    """Processor time of all processes that this one has started and that have ended, s."""
+    used = resource.getrusage(resource.RUSAGE_CHILDREN)
+    return used.ru_utime + used.ru_stime
 
 
 def yardstick_s(bench: Bench, run: Path) -> float:
@@ -101,9 +158,14 @@ def accuracy(bench: Bench, scenes: list[Scene], methods: list[str]) -> list[dict
             say(f"accuracy of `{method}` on {scene.name}")
             result: dict = {"scene": scene.name, "method": method}
             try:
-                out, _ = bench.process(run, method, few=True, keep=True)
+                out, _ = bench.process(run, method, True, "--set", "stripe.keep=true")
                 result["figures"] = evaluate(truth, read_products(out))
                 shutil.rmtree(out)
+                # The publication's way has no place for a pose.
+                if scene.name in JITTER_SCENES and method != "paper":
+                    out, _ = bench.process(run, method, True, "--poses", run / "truth" / "trajectory.csv")
+                    result["figures"]["jitter_true_poses_mm"] = evaluate(truth, read_products(out))["jitter_mm"]
+                    shutil.rmtree(out)
             except BenchError as error:
                 say(str(error))
                 result["error"] = str(error)
@@ -145,11 +207,14 @@ def report(work: Path, results: dict, straight: bool) -> list[Table]:
     """Writes bench.json and bench.md from what there is so far; the tables."""
     tables: list[Table] = []
     if results.get("speed"):
-        tables += [speed_table(results["speed"]), stages_table(results["speed"])]
+        tables.append(speed_table(results["speed"]))
+        if results.get("long_speed"):
+            tables.append(long_speed_table(results["long_speed"], LONG_S))
+        tables.append(stages_table(results["speed"]))
     if results.get("memory"):
         tables.append(memory_table(results["memory"], straight))
     if results.get("exports"):
-        tables.append(exports_table(results["exports"]))
+        tables += [exports_table(results["exports"]), long_job_table(results["exports"]["job"])]
     if results.get("accuracy"):
         tables += accuracy_tables(results["accuracy"])
     (work / "bench.json").write_text(json.dumps(results, indent=2))
@@ -210,6 +275,9 @@ def main() -> None:
     if "speed" not in skip:
         results["speed"] = speed(bench, [by_name[name] for name in SPEED_SCENES], methods, options.rounds)
         report(options.work, results, options.straight)
+        if "metric" in methods:
+            results["long_speed"] = long_speed(bench, [by_name[name] for name in SPEED_SCENES], options.rounds)
+            report(options.work, results, options.straight)
     if "accuracy" not in skip:
         results["accuracy"] = accuracy(bench, scenes, methods)
         report(options.work, results, options.straight)

@@ -1,14 +1,13 @@
-"""What keeping and handing on costs: the archive's size, and the exports of a long run's cloud."""
+"""What keeping and handing on costs: the archive's size, the exports of a long run's cloud and of a whole long job."""
 
 import json
 import shutil
-import sys
-import time
 from pathlib import Path
 
 import numpy as np
 
-from bench_runs import Bench, Scene, call, say
+from bench_long_job import export, long_job
+from bench_runs import Bench, Scene, say
 from bench_tables import Table, number
 
 FORMATS = ("laz", "pcd", "e57", "ply")
@@ -59,32 +58,10 @@ def exports(bench: Bench, scene: Scene, minutes: int) -> dict:
     shutil.rmtree(folder, ignore_errors=True)
     folder.mkdir(parents=True)
     points = long_cloud(products / "cloud.ply", folder / "cloud.ply", minutes * 60 * FPS)
-    rows = []
-    for form in FORMATS:
-        say(f"export of {points:,} points as {form}")
-        out = folder / f"out.{form}"
-        begun = time.perf_counter()
-        command = [sys.executable, "-c", PEAK, bench.stria, "export", folder, "--format", form, "--out", out]
-        report = call(command, f"export as {form}")
-        rows.append(
-            {
-                "format": form,
-                "seconds": time.perf_counter() - begun,
-                "mb": out.stat().st_size / 1e6,
-                "peak_mb": float(report.strip().split("\n")[-1]),
-            }
-        )
-        out.unlink()
+    say(f"exporting {points:,} points")
+    rows = [export(bench, folder, form, form) for form in FORMATS]
     shutil.rmtree(folder)
-    return {"minutes": minutes, "points": points, "archive": archive, "rows": rows}
-
-
-PEAK = """
-import resource, subprocess, sys
-code = subprocess.run(sys.argv[1:], stdout=subprocess.DEVNULL).returncode
-print(resource.getrusage(resource.RUSAGE_CHILDREN).ru_maxrss / 1e3)
-sys.exit(code)
-"""
+    return {"minutes": minutes, "points": points, "archive": archive, "rows": rows, "job": long_job(bench, minutes)}
 
 
 def exports_table(result: dict) -> Table:

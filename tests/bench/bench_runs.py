@@ -105,17 +105,19 @@ class Bench:
             part.rename(long)
         return long
 
-    def process_command(self, video: Path, rig: Path, method: str, out: Path, few: bool, keep: bool = False) -> list:
+    def process_command(self, video: Path, rig: Path, method: str, out: Path, few: bool) -> list:
         """The command line of one processing."""
         command = [self.stria, "process", video, "--rig", rig, "--recipe", method, "--out", out]
-        command += ["--only", FEW] if few else []
-        return command + (["--set", "stripe.keep=true"] if keep else [])
+        return command + (["--only", FEW] if few else [])
 
-    def process(self, run: Path, method: str, few: bool, keep: bool = False) -> tuple[Path, float]:
-        """Processes a run; its product folder and the wall time in seconds."""
+    def process(
+        self, run: Path, method: str, few: bool, *more: str | Path, video: Path | None = None
+    ) -> tuple[Path, float]:
+        """Processes a run, or another video of its rig, with `more` on the command line; its product folder and the wall
+        time in seconds."""
         out = self.work / "products" / f"{run.name}-{method}{'-few' if few else ''}"
         shutil.rmtree(out, ignore_errors=True)
-        command = self.process_command(run / "video.mp4", run / "rig.toml", method, out, few, keep)
+        command = [*self.process_command(video or run / "video.mp4", run / "rig.toml", method, out, few), *more]
         begun = time.perf_counter()
         call(command, f"`{method}` on {run.name}", DONE)
         return out, time.perf_counter() - begun

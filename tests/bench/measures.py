@@ -107,6 +107,16 @@ def pose_error(run: Run, trajectory: Trajectory, alignment: Alignment) -> dict:
     return figures
 
 
+def drift(run: Run, trajectory: Trajectory, stated: dict | None) -> dict:
+    """Where the last frame is, against the truth and against what the manifest states of it: the largest of the three
+    directions, in stated standard deviations."""
+    if not stated or not np.isfinite(trajectory.position_mm[-1]).all():
+        return {}
+    off_mm = trajectory.position_mm[-1] - run.trajectory.position_mm[trajectory.frame[-1]]
+    stated_mm = np.array([stated["x_mm"], stated["y_mm"], stated["z_mm"]])
+    return {"drift_sigmas": float(np.max(np.abs(off_mm) / stated_mm)), "drift_x_mm": float(stated_mm[0])}
+
+
 def runs_of(mask: np.ndarray) -> list[tuple[int, int]]:
     """The stretches (first, one past the last) where a mask [n] is true."""
     edges = np.flatnonzero(np.diff(np.concatenate([[0], mask.astype(np.int8), [0]])))

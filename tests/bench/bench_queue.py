@@ -1,9 +1,10 @@
 """Stria's queue beside graphile_worker on the same PostgreSQL, in turns, in one run.
 
-usage: queue.py     (`make bench-queue` installs what it needs)
+usage: bench_queue.py     (`make bench-queue` installs what it needs)
 
-A job here does nothing: it is claimed and ended. What counts is the ratio of the two. A PostgreSQL of its own is started on
-a free port, with its usual settings, and is gone afterwards.
+A job here does nothing: it is claimed and ended. What counts is the ratio of the two. Then Stria's lists, claims and counts
+beside 10,000 and 1,000,000 jobs, on SQLite and PostgreSQL. A PostgreSQL of its own is started on a free port, with its usual
+settings, and is gone afterwards.
 """
 
 import json
@@ -73,12 +74,21 @@ class Postgres:
         shutil.rmtree(self.folder, ignore_errors=True)
 
 
-def figures(command, variables, folder):
+def printed(command, variables, folder):
     done = subprocess.run(command, cwd=folder, env={**os.environ, **variables}, capture_output=True, text=True)
-    line = next((line for line in done.stdout.splitlines() if "FIGURES " in line), None)
-    if done.returncode != 0 or line is None:
+    if done.returncode != 0:
         sys.exit(f"{command[0]} failed:\n{done.stdout}\n{done.stderr}")
-    return json.loads(line.split("FIGURES ", 1)[1])
+    return done.stdout
+
+
+def figures(command, variables, folder):
+    return json.loads(printed(command, variables, folder).split("FIGURES ", 1)[1].splitlines()[0])
+
+
+def stria_bench(name, url):
+    """Runs one of the benches inside the server's own tests."""
+    return ["cargo", "test", "--release", "--locked", "--workspace", "--bin", "stria", "--", "--ignored", "--exact",
+            "--nocapture", name], {"STRIA_BENCH_DATABASE": url}, ROOT
 
 
 def main():
@@ -89,12 +99,10 @@ def main():
     try:
         for number in range(ROUNDS):
             url = postgres.database(f"stria{number}")
-            stria.append(figures(
-                ["cargo", "test", "--release", "--locked", "--workspace", "--bin", "stria", "--",
-                 "--ignored", "--exact", "--nocapture", "queue::rate::rate"],
-                {"STRIA_BENCH_DATABASE": url}, ROOT))
+            stria.append(figures(*stria_bench("queue::rate::rate", url)))
             url = postgres.database(f"other{number}")
             other.append(figures(["node", "queue.mjs"], {"DATABASE_URL": url}, ROOT / "tests/bench/queue"))
+        scale = printed(*stria_bench("queue::scale::scale", postgres.database("scale")))
     finally:
         postgres.stop()
     print("| what | Stria | graphile_worker | ratio | slowest–fastest |\n|---|---:|---:|---:|---:|")
@@ -103,7 +111,8 @@ def main():
         middle = [statistics.median(round_[name] for round_ in rounds) for rounds, name in [(stria, own), (other, theirs)]]
         print(f"| {words} | {middle[0]:,.1f} | {middle[1]:,.1f} | {statistics.median(ratios):.2f} "
               f"| {min(ratios):.2f}–{max(ratios):.2f} |")
-    print(f"\nMedians of {ROUNDS} rounds taken in turns, ratios taken within a round.")
+    print(f"\nMedians of {ROUNDS} rounds taken in turns, ratios taken within a round.\n")
+    print("\n".join(line for line in scale.splitlines() if line.startswith("|")))
 
 
 if __name__ == "__main__":
