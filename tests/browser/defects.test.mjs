@@ -2,7 +2,7 @@
 
 import assert from "node:assert/strict";
 import { after, before, test } from "node:test";
-import { getJson, mapSettled, measuredRun, onPage, openPage, simulate, startBrowser, startServer, until } from "./support.mjs";
+import { getJson, mapSettled, measuredRun, onPage, openPage, simulate, soon, startBrowser, startServer } from "./support.mjs";
 import { lookAround } from "./looks.mjs";
 
 let server, empty, browser, earlier, later, first, second, defects;
@@ -36,18 +36,18 @@ test("the list over all runs: filters, an address that keeps them, files", async
   await page.getByLabel("Depth from, mm").fill("9");
   const wanted = all.filter((defect) => defect.kind === "dent" && Math.abs(defect.depth_mm) >= 9).length;
   assert.ok(wanted > 0 && wanted < all.length);
-  await until("only those are listed", 10_000, async () => (await rows.count()) === wanted);
+  await soon("only those are listed", async () => (await rows.count()) === wanted);
   const csv = await fetch(new URL(await page.getByRole("link", { name: "CSV" }).getAttribute("href"), server.url));
   assert.equal((await csv.text()).trim().split("\n").length, wanted + 1);
   const geojson = await fetch(new URL(await page.getByRole("link", { name: "GeoJSON" }).getAttribute("href"), server.url));
   assert.equal((await geojson.json()).features.length, wanted);
   await page.reload();
-  await until("the address keeps the filter", 10_000, async () => (await rows.count()) === wanted);
+  await soon("the address keeps the filter", async () => (await rows.count()) === wanted);
   assert.equal(await page.getByLabel("Depth from, mm").inputValue(), "9");
   await page.getByLabel("Depth from, mm").fill("900");
   await page.getByText("No defect fits these filters.").waitFor();
   await page.getByRole("button", { name: "Clear filters" }).click();
-  await until("all are listed again", 10_000, async () => (await rows.count()) === all.length);
+  await soon("all are listed again", async () => (await rows.count()) === all.length);
   await close();
 });
 
@@ -102,7 +102,7 @@ test("a run's defects stand numbered on its map, at their places", async () => {
   await page.getByText(/On this run a round dent of 20 mm radius must be/).waitFor();
   const third = defects[2];
   await list.nth(2).getByRole("button", { name: /^Show on the map/ }).click();
-  await until("the map looks there", 5000, async () => Math.hypot((await view()).x_mm - third.x_mm, (await view()).y_mm - third.y_mm) < 1);
+  await soon("the map looks there", async () => Math.hypot((await view()).x_mm - third.x_mm, (await view()).y_mm - third.y_mm) < 1);
   assert.equal(await list.nth(2).getAttribute("class"), "picked");
   // A click on another's mark chooses it; a ring of its colour is drawn where the defect is.
   await page.getByRole("button", { name: "Whole map" }).click();
@@ -110,7 +110,7 @@ test("a run's defects stand numbered on its map, at their places", async () => {
   const fourth = defects[3];
   const place = await onPage(page, fourth.x_mm, fourth.y_mm);
   await page.mouse.click(place.x, place.y);
-  await until("the click chose it", 5000, async () => (await list.nth(3).getAttribute("class")) === "picked");
+  await soon("the click chose it", async () => (await list.nth(3).getAttribute("class")) === "picked");
   // The residual map as a layer: what it tells under the pointer is about the defect's depth, without the wall's distance.
   await page.getByRole("radio", { name: "Deviation" }).check({ force: true });
   await list.nth(2).getByRole("button", { name: /^Show on the map/ }).click();
@@ -119,7 +119,7 @@ test("a run's defects stand numbered on its map, at their places", async () => {
   const middle = await onPage(page, third.x_mm, third.y_mm);
   await page.mouse.move(middle.x, middle.y);
   const told = page.locator(".readout .depth dd");
-  const deviation = await until("the value is known", 10_000, async () => Number(await told.getAttribute("data-z").catch(() => null)) || null);
+  const deviation = await soon("the value is known", async () => Number(await told.getAttribute("data-z").catch(() => null)) || null);
   assert.ok(Math.abs(deviation - third.depth_mm) < Math.max(1.5, 0.4 * Math.abs(third.depth_mm)), `${deviation} mm at a defect of ${third.depth_mm} mm`);
   assert.equal(new URL(page.url()).searchParams.get("layer"), "deviation");
   // The report opens in a page of its own, where nothing of it can run.
@@ -141,7 +141,7 @@ test("two runs of an asset side by side show what changed", async () => {
   await page.waitForURL(/compare/);
   assert.equal(new URL(page.url()).searchParams.get("left"), first.job.id, "the earlier one is on the left");
   const table = page.getByRole("region", { name: "What changed on the wall" });
-  await table.waitFor({ timeout: 60_000 });
+  await table.waitFor();
   const words = await table.getByRole("row").allTextContents();
   assert.equal(words.filter((row) => /New|Grown/.test(row)).length, 2, words.join("\n"));
   assert.equal(words.filter((row) => /Shrunk|Vanished|Changed/.test(row)).length, 0, words.join("\n"));

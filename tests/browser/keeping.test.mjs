@@ -4,7 +4,7 @@ import assert from "node:assert/strict";
 import { readFile } from "node:fs/promises";
 import { createServer } from "node:http";
 import { after, before, test } from "node:test";
-import { getJson, keepPicture, openPage, sendRun, simulate, startBrowser, startServer, until } from "./support.mjs";
+import { getJson, keepPicture, openPage, sendRun, simulate, soon, startBrowser, startServer } from "./support.mjs";
 
 let locked, open, browser, run, runs, evil;
 
@@ -134,7 +134,7 @@ test("a session that ends is said, leads to the log-in and back, and the page go
   await page.getByLabel("Note", { exact: true }).fill("half written");
   await revoke(first);
   const out = page.getByRole("alert").filter({ hasText: "You are not logged in any more" });
-  await out.waitFor({ timeout: 15_000 });
+  await out.waitFor();
   await keepPicture(page, "logged-out");
   assert.equal(await out.getByRole("link", { name: "Log in" }).getAttribute("href"), "/login?next=%2Fqueue");
 
@@ -144,11 +144,11 @@ test("a session that ends is said, leads to the log-in and back, and the page go
   await tab.getByText("No runs yet").waitFor();
   await tab.close();
   await page.bringToFront();
-  await out.waitFor({ state: "detached", timeout: 15_000 });
+  await out.waitFor({ state: "detached" });
   assert.equal(await page.getByLabel("Note", { exact: true }).inputValue(), "half written");
 
   await revoke(second);
-  await out.getByRole("link", { name: "Log in" }).click({ timeout: 15_000 });
+  await out.getByRole("link", { name: "Log in" }).click();
   const third = await made("third");
   await logIn(page, third.secret);
   await page.waitForURL("**/queue");
@@ -290,7 +290,7 @@ test("what is said about a run is set right, and never over what somebody else w
   await form.getByLabel("Note").fill("ours");
   await form.getByRole("button", { name: "Save" }).click();
   await form.waitFor({ state: "hidden" });
-  await until("the note is ours", 5000, async () => (await getJson(open, `/api/runs/${id}`)).note === "ours");
+  await soon("the note is ours", async () => (await getJson(open, `/api/runs/${id}`)).note === "ours");
   const log = (await getJson(open, "/api/audit")).items.filter(({ method, path }) => method === "PATCH" && path.endsWith(id));
   assert.deepEqual(log.map(({ status }) => status), [200, 412, 200, 200], "every try is in the audit log");
   await close();

@@ -3,7 +3,7 @@
 import assert from "node:assert/strict";
 import { readFile } from "node:fs/promises";
 import { after, before, test } from "node:test";
-import { getJson, keepPicture, openPage, simulate, startBrowser, startServer, until } from "./support.mjs";
+import { getJson, keepPicture, openPage, simulate, soon, startBrowser, startServer, until } from "./support.mjs";
 
 const RUNS = 2000;
 const AT_ONCE = 16;
@@ -47,7 +47,7 @@ test(`${RUNS} runs: only the rows in view exist, scrolling reaches the last one`
   t.diagnostic(`${RUNS} runs loaded in ${((performance.now() - started) / 1000).toFixed(1)} s of scrolling; ${most} rows at most`);
   assert.ok(most < 120, `${most} rows exist at once`);
   const { items } = await getJson(server, "/api/runs?sort=created&limit=1");
-  await until("the last run is in view", 30_000, async () => {
+  await soon("the last run is in view", async () => {
     // The last page may have made the list longer since it was scrolled.
     await page.evaluate(() => scrollTo(0, document.documentElement.scrollHeight));
     return page.getByText(items[0].source.filename).isVisible();
@@ -62,20 +62,20 @@ test("search, filters and order; the link shows the same list to somebody else",
   await page.goto("/");
   const rows = () => page.locator(".virtual > li .run-file").allTextContents();
   await page.getByRole("searchbox", { name: "Search runs" }).fill("run-0421");
-  await until("the one run is found", 10_000, async () => (await rows()).join() === "run-0421.mp4");
+  await soon("the one run is found", async () => (await rows()).join() === "run-0421.mp4");
   await page.getByRole("button", { name: "Clear filters" }).click();
   await page.getByLabel("Asset").selectOption("Sewer 3");
   await page.getByLabel("Order").selectOption("recorded");
   await page.getByLabel("Recorded from").fill("2026-02-01");
   await page.getByLabel("until").fill("2026-02-01");
-  await until("the list follows", 10_000, async () => {
+  await soon("the list follows", async () => {
     const found = await rows();
     return found.length > 0 && found.every((name) => Number(name.slice(4, 8)) % 7 === 3 && Number(name.slice(4, 8)) % 200 === 31);
   });
   await page.getByLabel("State").selectOption("failed");
   await page.getByText("No run fits these filters.").waitFor();
   await page.getByLabel("State").selectOption("queued");
-  await until("they wait", 10_000, async () => (await rows()).length > 0);
+  await soon("they wait", async () => (await rows()).length > 0);
   await keepPicture(page, "runs-filtered");
   const shown = await rows();
   const other = await openPage(browser, server);
@@ -85,7 +85,7 @@ test("search, filters and order; the link shows the same list to somebody else",
   await other.page.locator(".run-link").first().click();
   await other.page.getByRole("heading", { level: 1 }).waitFor();
   await other.page.goBack();
-  await until("back is where one was", 10_000, async () => (await other.page.locator(".virtual > li .run-file").allTextContents()).join() === shown.join());
+  await soon("back is where one was", async () => (await other.page.locator(".virtual > li .run-file").allTextContents()).join() === shown.join());
   await other.close();
   await close();
 });

@@ -3,7 +3,7 @@
 import assert from "node:assert/strict";
 import { after, before, test } from "node:test";
 import { setTimeout as sleep } from "node:timers/promises";
-import { getJson, jobEnds, keepPicture, mapSettled, openPage, sendRun, simulate, startBrowser, startServer, throughDeafWay, until, walk } from "./support.mjs";
+import { getJson, jobEnds, keepPicture, mapSettled, openPage, sendRun, simulate, soon, startBrowser, startServer, throughDeafWay, until, walk } from "./support.mjs";
 
 const CUT_MS = 20_000;
 const ASLEEP_MS = 4000;
@@ -31,8 +31,8 @@ test("frame, line, health and map grow; a cut of 20 s and an hour's sleep are ca
   await page.clock.install();
   await page.goto("/live");
   await page.getByRole("link", { name: /^Watch watched/ }).click();
-  await page.locator(".live-picture canvas[data-frame]").waitFor({ timeout: 60_000 });
-  await page.locator(".live-map .map-top").waitFor({ timeout: 60_000 });
+  await page.locator(".live-picture canvas[data-frame]").waitFor();
+  await page.locator(".live-map .map-top").waitFor();
   const [firstEnd, firstFrame] = [await end(page), await frame(page)];
   const marked = await page.locator(".live-picture canvas").evaluate((canvas) => {
     const { data } = canvas.getContext("2d").getImageData(0, 0, canvas.width, canvas.height);
@@ -42,7 +42,7 @@ test("frame, line, health and map grow; a cut of 20 s and an hour's sleep are ca
   });
   assert.ok(marked > 100, `the line is drawn on the frame: ${marked} pixels`);
   const grownEnd = await until("the map grows", 60_000, async () => (await end(page)) > firstEnd + 20 && end(page));
-  await until("the frames go on", 20_000, async () => (await frame(page)) > firstFrame);
+  await soon("the frames go on", async () => (await frame(page)) > firstFrame);
   await keepPicture(page, "live");
 
   await context.setOffline(true);
@@ -51,7 +51,7 @@ test("frame, line, health and map grow; a cut of 20 s and an hour's sleep are ca
   const cutEnd = await end(page);
   assert.equal((await getJson(server, `/api/jobs/${robot.job}`)).state, "running", "the run outlasts the cut");
   await context.setOffline(false);
-  await until("the map has caught up", 30_000, async () => (await end(page)) > cutEnd + 20);
+  await soon("the map has caught up", async () => (await end(page)) > cutEnd + 20);
   assert.ok(cutEnd >= grownEnd);
   await page.getByText("Connected").waitFor();
   await keepPicture(page, "live-after-cut");
@@ -70,8 +70,8 @@ test("frame, line, health and map grow; a cut of 20 s and an hour's sleep are ca
     assert.ok(way.deafen() > 0, "there was a connection to lose");
     await sleep(ASLEEP_MS);
   });
-  await until("the map has caught up after the sleep", 30_000, async () => (await end(page)) > beforeSleep + 20);
-  await until("the frames have, too", 30_000, async () => (await frame(page)) > frameBefore);
+  await soon("the map has caught up after the sleep", async () => (await end(page)) > beforeSleep + 20);
+  await soon("the frames have, too", async () => (await frame(page)) > frameBefore);
 
   // The run ends while nobody hears it.
   await sleeps(async () => {
@@ -79,7 +79,7 @@ test("frame, line, health and map grow; a cut of 20 s and an hour's sleep are ca
     await robot.stop();
     await jobEnds(server, robot.job);
   });
-  await page.getByRole("tab", { name: "Files" }).waitFor({ timeout: 30_000 });
+  await page.getByRole("tab", { name: "Files" }).waitFor();
   await page.locator(".glance").waitFor();
   await mapSettled(page);
   await keepPicture(page, "live-after-sleep");
@@ -93,7 +93,7 @@ test("the end of a run is seen without a reload: the live part becomes the finis
   const { page, close } = await openPage(browser, server);
   await page.goto(`/runs/${sent.id}`);
   await jobEnds(server, sent.job.id);
-  await page.getByRole("tab", { name: "Files" }).waitFor({ timeout: 20_000 });
+  await page.getByRole("tab", { name: "Files" }).waitFor();
   await page.locator(".glance").waitFor();
   await page.locator(".map-top").waitFor();
   await short.remove();

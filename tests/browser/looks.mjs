@@ -1,7 +1,7 @@
 // A page in light and dark and at three widths.
 
 import assert from "node:assert/strict";
-import { keepPicture, mapSettled, openPage, seriousViolations, until } from "./support.mjs";
+import { keepPicture, mapSettled, openPage, seriousViolations, soon } from "./support.mjs";
 
 const SIZES = [
   { width: 1440, height: 900 },
@@ -20,7 +20,7 @@ export async function lookAround(browser, at, name, address, ready) {
       await page.emulateMedia({ colorScheme });
       await page.setViewportSize(viewport);
       for (const map of await page.locator(".map-panel").all()) await mapSettled(page, map);
-      await until("pictures are loaded", 10_000, () => page.evaluate(() => [...document.images].every((image) => image.complete || image.loading === "lazy")));
+      await soon("pictures are loaded", () => page.evaluate(() => [...document.images].every((image) => image.complete || image.loading === "lazy")));
       await keepPicture(page, look);
       assert.equal(await page.evaluate(() => document.documentElement.scrollWidth - innerWidth), 0, `${look}: nothing sticks out to the side`);
       assert.deepEqual(await seriousViolations(page), [], look);

@@ -4,7 +4,7 @@ import assert from "node:assert/strict";
 import { readFile, writeFile } from "node:fs/promises";
 import path from "node:path";
 import { after, before, test } from "node:test";
-import { fetchProduct, getJson, keepPicture, mapSettled, measuredRun, onPage, openPage, readWith, seriousViolations, simulate, startBrowser, startServer, until } from "./support.mjs";
+import { fetchProduct, getJson, keepPicture, mapSettled, measuredRun, onPage, openPage, readWith, seriousViolations, simulate, soon, startBrowser, startServer } from "./support.mjs";
 
 let server, browser, gauge, gaugeRun, pipe, pipeRun;
 
@@ -40,7 +40,7 @@ async function openMap(run, query = "") {
 async function readAt(page, x, y) {
   await page.mouse.move(x, y);
   const value = page.locator(".readout .depth dd");
-  await until("the value under the pointer is known", 10_000, async () => {
+  await soon("the value under the pointer is known", async () => {
     const text = await value.textContent().catch(() => "…");
     return text !== "…" && !text.startsWith("≈");
   });
@@ -108,7 +108,7 @@ test("a cross-section's numbers are depth.tif's, on the page, in the clipboard a
     await page.getByText(tool, { exact: true }).click();
     const summary = await page.locator(".section-panel p").first().textContent();
     await page.locator(".map-top").click();
-    await until(`${tool} is shown`, 10_000, async () => (await page.locator(".section-panel p").first().textContent()) !== summary);
+    await soon(`${tool} is shown`, async () => (await page.locator(".section-panel p").first().textContent()) !== summary);
   }
   await close();
 });
@@ -128,7 +128,7 @@ test("measuring on the step gauge: distance and depth within a grid cell", async
       await page.mouse.click(x, y);
     }
     const of = async (name) => Number(await page.locator(".measured dl div", { hasText: name }).locator("dd").getAttribute("data-mm"));
-    await until("the depths are known", 10_000, async () => (await page.locator(".measured dl div", { hasText: "Straight" }).count()) === 1);
+    await soon("the depths are known", async () => (await page.locator(".measured dl div", { hasText: "Straight" }).count()) === 1);
     const [dx, dy] = [places[to][0] - places[from][0], places[to][1] - places[from][1]];
     // A click hits a pixel of the screen: half of one at each end, in mm.
     const screen_mm = await page.locator(".map-top").evaluate((element) => element.striaMap.view.mm_per_css_px);
@@ -154,25 +154,25 @@ test("layers fade into each other and the colours' range can be set", async () =
   const depth = await middle();
   assert.ok(saturation(depth) > 30, `depth is coloured: ${depth}`);
   await page.getByText("Relief", { exact: true }).first().click();
-  const relief = await until("the relief is gray", 10_000, async () => {
+  const relief = await soon("the relief is gray", async () => {
     const now = await middle();
     return saturation(now) < 6 && now;
   });
   await page.getByText("Image", { exact: true }).click();
   await mapSettled(page);
-  const image = await until("the image is shown", 10_000, async () => {
+  const image = await soon("the image is shown", async () => {
     const now = await middle();
     return !same(now, relief) && now;
   });
   await page.getByLabel("Fade to image").fill("0.5");
   await page.getByText("Depth", { exact: true }).first().click();
   let now = null;
-  await until(`depth is back: ${depth}`, 10_000, async () => same((now = await middle()), depth)).catch((error) => assert.fail(`${error.message}, not ${now}`));
+  await soon(`depth is back: ${depth}`, async () => same((now = await middle()), depth)).catch((error) => assert.fail(`${error.message}, not ${now}`));
   await page.getByLabel("nearest, mm").fill("100");
   await page.getByLabel("nearest, mm").press("Enter");
-  await until("another range, another colour", 10_000, async () => !same(await middle(), depth));
+  await soon("another range, another colour", async () => !same(await middle(), depth));
   await page.getByRole("button", { name: "Auto" }).click();
-  await until("the automatic range again", 10_000, async () => same(await middle(), depth));
+  await soon("the automatic range again", async () => same(await middle(), depth));
   assert.ok(!same(image, depth), `the image is not the depth: ${image}`);
   await close();
 });
@@ -190,7 +190,7 @@ test("a link restores place, zoom, layer, range and section", async () => {
   await page.mouse.click(box.x + 500, box.y + 250);
   await page.getByLabel("farthest, mm").fill("470");
   await page.getByLabel("farthest, mm").press("Enter");
-  await until("the address says all of it", 5000, () => ["at=", "look=", "range=", "cut="].every((word) => page.url().includes(word)));
+  await soon("the address says all of it", () => ["at=", "look=", "range=", "cut="].every((word) => page.url().includes(word)));
   const view = await page.locator(".map-top").evaluate((element) => element.striaMap.view);
   const other = await openPage(browser, server);
   await other.page.goto(page.url());

@@ -3,7 +3,7 @@
 import assert from "node:assert/strict";
 import { gzipSync } from "node:zlib";
 import { after, before, test } from "node:test";
-import { getJson, jobEnds, mapSettled, measuredRun, openPage, sendRun, simulate, startBrowser, startServer, until } from "./support.mjs";
+import { getJson, jobEnds, mapSettled, measuredRun, openPage, sendRun, simulate, soon, startBrowser, startServer } from "./support.mjs";
 import { lookAround } from "./looks.mjs";
 
 const FIRST_PAGE_BYTES = 200_000;
@@ -16,7 +16,7 @@ before(async () => {
   const post = async (path, body) => (await fetch(new URL(path, server.url), { method: "POST", headers: { "content-type": "application/json" }, body: JSON.stringify(body) })).json();
   batch = await post("/api/batches", { runs: [second.id], recipe: "paper", note: "The publication's way" });
   await post("/api/tokens", { name: "robot 7", scopes: ["ingest", "read"] });
-  const made = await until("the batch has its job", 20_000, async () => (await getJson(server, `/api/jobs?run=${second.id}`)).items.find((job) => job.batch === batch.id));
+  const made = await soon("the batch has its job", async () => (await getJson(server, `/api/jobs?run=${second.id}`)).items.find((job) => job.batch === batch.id));
   await jobEnds(server, made.id);
   // Two that cannot be measured: states and errors are part of the look.
   const bad = await sendRun(server, { ...run, video: run.rig }, { filename: "notes.mp4", asset: "Sewer 12, north" });

@@ -20,7 +20,10 @@ const chromiumPath = process.env.CHROMIUM_BIN ?? "/usr/bin/chromium";
 /** Where screenshots go, for people to look at. */
 const pictures = process.env.STRIA_PICTURES ?? path.join(repository, "target/browser");
 
-const READY_MS = 20_000;
+const READY_MS = 60_000;
+
+/** How long a page may take for what it does by itself: far more than it needs, for tests run on slow machines as well and never measure time. */
+const SOON_MS = 60_000;
 
 /**
  * Starts `stria serve` on a free port with an empty data folder; `stop` ends it and checks that it was still well. `locked`: with its
@@ -110,6 +113,7 @@ export async function openPage(browser, server, options = {}) {
     if (/content security policy|refused to/i.test(message.text())) violations.push(`console: ${message.text()}`);
   });
   context.on("weberror", (error) => violations.push(`error in a script: ${error.error().stack}`));
+  context.setDefaultTimeout(SOON_MS);
   const page = await context.newPage();
   const close = async () => {
     await context.close();
@@ -161,6 +165,9 @@ export async function until(what, withinMs, ask) {
   }
 }
 
+/** What a page does by itself, without a job to wait for: asks until it is there. */
+export const soon = (what, ask) => until(what, SOON_MS, ask);
+
 /** JSON from the server, past the browser. */
 export async function getJson(server, address) {
   const response = await fetch(new URL(address, server.url));
@@ -198,7 +205,7 @@ export async function walk(server, run, stream, fields, pace = 0.5) {
   const quiet = ["-hide_banner", "-loglevel", "error", "-nostdin"];
   const robot = spawn("ffmpeg", [...quiet, "-readrate", `${pace}`, "-i", run.video, "-q:v", "3", "-f", "mpjpeg", "-method", "POST", address.href]);
   const ended = new Promise((done, fail) => robot.once("exit", done).once("error", (error) => fail(new Error(`ffmpeg, which \`make setup\` installs: ${error.message}`))));
-  const known = await Promise.race([ended.then(() => assert.fail("ffmpeg ended at once")), until("the robot is seen", 20_000, async () => (await getJson(server, "/api/live")).items.find((item) => item.stream === stream))]);
+  const known = await Promise.race([ended.then(() => assert.fail("ffmpeg ended at once")), soon("the robot is seen", async () => (await getJson(server, "/api/live")).items.find((item) => item.stream === stream))]);
   const stop = async () => {
     robot.kill("SIGKILL");
     await ended;
@@ -253,7 +260,7 @@ export async function fetchProduct(server, job, name, folder) {
 /** The map on the page shows all that is in view, sharp. */
 export async function mapSettled(page, within = page) {
   await within.locator(".map-top[data-ready]").first().waitFor();
-  await within.locator(".map-loading[data-settled=true]").first().waitFor({ state: "attached", timeout: 60_000 });
+  await within.locator(".map-loading[data-settled=true]").first().waitFor({ state: "attached" });
 }
 
 /** Where a place of the world is on the page, and the other way round: from the map's own view. */

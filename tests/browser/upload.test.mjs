@@ -7,7 +7,7 @@ import { connect, createServer } from "node:net";
 import path from "node:path";
 import { after, before, test } from "node:test";
 import { setTimeout as sleep } from "node:timers/promises";
-import { dropFiles, getJson, jobEnds, keepPicture, openPage, simulate, startBrowser, startServer, thinLink, until } from "./support.mjs";
+import { dropFiles, getJson, jobEnds, keepPicture, openPage, simulate, soon, startBrowser, startServer, thinLink, until } from "./support.mjs";
 
 const DONE_MS = 120_000;
 /** Between two clicks on downloads: Chromium drops those of a page that starts more than ten in a second. */
@@ -101,14 +101,14 @@ test("files dropped on the list go to the page for sending; the run shows in the
   const row = page.getByRole("listitem").filter({ hasText: "dropped wall" });
   await row.getByText("Done").waitFor();
   const thumbnail = row.getByRole("img");
-  await until("the list's picture has been loaded", 10_000, () => thumbnail.evaluate((image) => image.complete && image.naturalWidth > 0));
+  await soon("the list's picture has been loaded", () => thumbnail.evaluate((image) => image.complete && image.naturalWidth > 0));
   await row.getByRole("link").click();
   await page.getByRole("button", { name: "Delete this run" }).click();
   await page.getByRole("button", { name: "Keep it" }).click();
   await page.getByRole("button", { name: "Delete this run" }).click();
   await page.getByRole("button", { name: "Delete for good" }).click();
   await page.getByRole("heading", { name: "Runs" }).waitFor();
-  await until("the run is gone from the list", 10_000, async () => (await row.count()) === 0);
+  await soon("the run is gone from the list", async () => (await row.count()) === 0);
   await close();
 });
 
@@ -131,16 +131,16 @@ test("paused, gone on with, cut off, and whole in the end", async () => {
   const { page, context, close } = await openPage(browser, server);
   const link = await thinLink(page);
   await choose(page, [big, run.rig], "a large one");
-  await until("it is on its way", 20_000, async () => (await sentBytes(page, "big.mp4")) > 500_000);
+  await soon("it is on its way", async () => (await sentBytes(page, "big.mp4")) > 500_000);
   await item(page, "big.mp4").getByText(/left/).waitFor();
   await keepPicture(page, "sending");
   await item(page, "big.mp4").getByRole("button", { name: /^Pause/ }).click();
   await item(page, "big.mp4").getByText("Paused").waitFor();
   const paused = await sentBytes(page, "big.mp4");
   await item(page, "big.mp4").getByRole("button", { name: /^Go on/ }).click();
-  await until("it goes on from there", 20_000, async () => (await sentBytes(page, "big.mp4")) > paused + 200_000);
+  await soon("it goes on from there", async () => (await sentBytes(page, "big.mp4")) > paused + 200_000);
   await context.setOffline(true);
-  await item(page, "big.mp4").getByText("The link is down").waitFor({ timeout: 20_000 });
+  await item(page, "big.mp4").getByText("The link is down").waitFor();
   const cut = await sentBytes(page, "big.mp4");
   assert.ok(cut >= paused, "nothing that arrived is lost");
   await link.send("Network.emulateNetworkConditions", { offline: false, latency: 0, downloadThroughput: -1, uploadThroughput: -1 });
@@ -155,7 +155,7 @@ test("a reload in the middle: the same file again goes on where it stopped", asy
   const { page, close } = await openPage(browser, server);
   const link = await thinLink(page);
   await choose(page, [big, run.rig], "after a reload");
-  await until("half a megabyte is there", 20_000, async () => (await sentBytes(page, "big.mp4")) > 500_000);
+  await soon("half a megabyte is there", async () => (await sentBytes(page, "big.mp4")) > 500_000);
   page.on("dialog", (dialog) => dialog.accept()); // "leave the page?"
   await page.reload();
   await item(page, "big.mp4").getByText("Was interrupted").waitFor();
@@ -185,7 +185,7 @@ test("a piece that the way spoils is refused and sent again, also where the brow
   });
   await choose(page, [big, run.rig], "by a bad way");
   assert.equal(await page.evaluate(() => "subtle" in crypto), false);
-  await item(page, "big.mp4").getByText("Has arrived").waitFor({ timeout: 60_000 });
+  await item(page, "big.mp4").getByText("Has arrived").waitFor();
   const [entry] = await arrived("by a bad way", 1, site);
   await sameSource(entry, big, site);
   assert.ok(way.spoilt(), "a byte became another on the way");
@@ -210,7 +210,7 @@ test("from the empty form to the result by keyboard alone", async () => {
   await tabTo(page, "Send the run");
   await page.keyboard.press("Enter");
   await page.getByText("Say which asset this is.").waitFor();
-  await until("the keyboard stands in the field that is missing", 2000, async () => (await focusedName(page)) === "Asset");
+  await soon("the keyboard stands in the field that is missing", async () => (await focusedName(page)) === "Asset");
   await page.keyboard.type("by keyboard");
   await page.keyboard.press("Enter");
   await page.getByRole("link", { name: "Show the run" }).waitFor();

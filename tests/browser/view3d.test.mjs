@@ -9,11 +9,10 @@ import { after, before, test } from "node:test";
 import { setTimeout as sleep } from "node:timers/promises";
 import { fileURLToPath } from "node:url";
 import { promisify } from "node:util";
-import { fetchProduct, getJson, jobEnds, keepPicture, openPage, sendRun, simulate, startBrowser, startServer, until, walk } from "./support.mjs";
+import { fetchProduct, getJson, jobEnds, keepPicture, openPage, sendRun, simulate, soon, startBrowser, startServer, until, walk } from "./support.mjs";
 
 const rerun = path.resolve(path.dirname(fileURLToPath(import.meta.url)), "../../target/python/bin/rerun");
 const DONE_MS = 120_000;
-const SHOWN_MS = 60_000;
 
 /** Share of the 3D view's pixels that the surface must colour, and how many times more than stand there without it. */
 const SURFACE_SHARE = 0.02;
@@ -43,7 +42,7 @@ test("a finished run: the surface is on the canvas, and its pixels are the surfa
   assert.equal(await page.locator("canvas").count(), 0, "nothing of the viewer is there before it is asked for");
 
   await page.getByRole("button", { name: "Open 3D view" }).click();
-  await page.getByText("The whole recording is shown").waitFor({ timeout: SHOWN_MS });
+  await page.getByText("The whole recording is shown").waitFor({ timeout: DONE_MS });
   const withSurface = await settledShare(page);
   await keepPicture(page.locator(".view").first(), "view3d");
 
@@ -54,7 +53,7 @@ test("a finished run: the surface is on the canvas, and its pixels are the surfa
     );
     await page.goto(address);
     await page.getByRole("button", { name: "Open 3D view" }).click();
-    await page.getByText("The whole recording is shown").waitFor({ timeout: SHOWN_MS });
+    await page.getByText("The whole recording is shown").waitFor({ timeout: DONE_MS });
     return settledShare(page);
   };
   // The same recording without the surface's points must look different just there.
@@ -92,7 +91,7 @@ test("a run that is being measured: the surface is on the canvas before the job 
   const { page, close } = await openPage(browser, server);
   await page.goto(`/runs/${robot.run}?tab=space`);
   await page.getByRole("button", { name: "Open 3D view" }).click();
-  await page.getByText(/^Live: \d+ parts? received/).waitFor({ timeout: SHOWN_MS });
+  await page.getByText(/^Live: \d+ parts? received/).waitFor({ timeout: DONE_MS });
   const share = await until("the surface shows while the job runs", DONE_MS, async () => {
     const now = await colouredShare(page);
     const { job } = await getJson(server, `/api/runs/${robot.run}`);
@@ -125,11 +124,11 @@ test("a long run has a recording of each stretch: one is chosen by chainage, the
   const ends = [500 - recordings[1].to_x_mm, 500 - recordings[1].from_x_mm].map((mm) => `${Math.round(mm)}\u00a0mm`);
   assert.equal(await choice.locator("option:checked").textContent(), ends.join(" to "));
   await page.getByRole("button", { name: "Open 3D view" }).click();
-  await page.getByText("This part of the run is shown, with every step.").waitFor({ timeout: SHOWN_MS });
+  await page.getByText("This part of the run is shown, with every step.").waitFor({ timeout: DONE_MS });
   assert.deepEqual(asked.filter((name) => name.endsWith(".rrd") || name === "recording"), [recordings[1].name]);
   await choice.selectOption({ index: 3 });
-  await page.getByText("This part of the run is shown, with every step.").waitFor({ timeout: SHOWN_MS });
-  await until("the third is loaded", 10_000, async () => asked.includes(recordings[2].name));
+  await page.getByText("This part of the run is shown, with every step.").waitFor({ timeout: DONE_MS });
+  await soon("the third is loaded", async () => asked.includes(recordings[2].name));
   assert.match(page.url(), /[?&]stretch=3/);
   await page.reload();
   await choice.waitFor();
@@ -147,7 +146,7 @@ test("the keyboard gets out of the 3D view, and it closes and opens again", asyn
   await page.getByRole("tab", { name: "Files" }).waitFor({ timeout: DONE_MS });
   for (let round = 0; round < 2; round += 1) {
     await page.getByRole("button", { name: "Open 3D view" }).click();
-    await page.getByText("The whole recording is shown").waitFor({ timeout: SHOWN_MS });
+    await page.getByText("The whole recording is shown").waitFor({ timeout: DONE_MS });
     await page.locator("canvas").click();
     await page.keyboard.press("Escape");
     assert.equal(await page.evaluate(() => document.activeElement?.textContent), "Close 3D view");
@@ -231,8 +230,9 @@ test("the light view draws the surface, turns it, and needs no viewer", async ()
   await page.getByRole("tab", { name: "Files" }).waitFor({ timeout: DONE_MS });
   await page.getByRole("button", { name: "Open light view" }).click();
   await page.getByText(/[\d,]+ points/).waitFor();
+  const canvas = page.locator(".view.light canvas");
   const drawn = () =>
-    page.locator(".view.light canvas").evaluate((canvas) => {
+    canvas.evaluate((canvas) => {
       const gl = canvas.getContext("webgl");
       const pixels = new Uint8Array(4 * canvas.width * canvas.height);
       gl.readPixels(0, 0, canvas.width, canvas.height, gl.RGBA, gl.UNSIGNED_BYTE, pixels);
@@ -242,15 +242,30 @@ test("the light view draws the surface, turns it, and needs no viewer", async ()
         count += 1;
         sum = (sum * 31 + pixels[at] + 7 * pixels[at + 1] + at) % 1_000_003;
       }
-      return { share: count / (pixels.length / 4), sum };
+      return { share: count / (pixels.length / 4), sum, lost: gl.isContextLost(), size: [canvas.width, canvas.height] };
     });
-  const first = await until("points are drawn", 10_000, async () => {
-    const now = await drawn();
-    return now.share > 0.1 && now;
-  });
+  const isDrawn = async (when) => {
+    let last;
+    const seen = soon(`points are drawn ${when}`, async () => (last = await drawn()).share > 0.1 && last);
+    return seen.catch((error) => assert.fail(`${error.message}; the canvas: ${JSON.stringify(last)}`));
+  };
+  const first = await isDrawn("at first");
   await keepPicture(page.locator(".view.light"), "light-view");
-  await page.locator(".view.light canvas").press("ArrowLeft");
-  await until("it turns", 5000, async () => (await drawn()).sum !== first.sum);
+  await canvas.press("ArrowLeft");
+  await soon("it turns", async () => (await drawn()).sum !== first.sum);
+
+  // What a driver that is reset does to every page: the picture is gone, the graphics card's memory too.
+  await canvas.evaluate(
+    (canvas) =>
+      new Promise((lost) => {
+        window.driver = canvas.getContext("webgl").getExtension("WEBGL_lose_context");
+        canvas.addEventListener("webglcontextlost", () => lost(), { once: true });
+        window.driver.loseContext();
+      }),
+  );
+  assert.deepEqual([(await drawn()).lost, (await drawn()).share], [true, 0]);
+  await page.evaluate(() => window.driver.restoreContext());
+  await isDrawn("after the driver's reset");
   assert.ok(asked.every((url) => !url.includes("/viewer/")), "nothing of the viewer was loaded");
   await run.remove();
   await close();

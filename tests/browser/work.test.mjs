@@ -3,7 +3,7 @@
 import assert from "node:assert/strict";
 import { readFile } from "node:fs/promises";
 import { after, before, test } from "node:test";
-import { getJson, jobEnds, keepPicture, mapSettled, measuredRun, openPage, sendRun, simulate, startBrowser, startServer, until } from "./support.mjs";
+import { getJson, jobEnds, keepPicture, mapSettled, measuredRun, openPage, sendRun, simulate, soon, startBrowser, startServer } from "./support.mjs";
 
 let server, idle, browser, run, done;
 
@@ -32,7 +32,7 @@ test("measuring again with one option changed, and the two side by side", async 
   await field.fill("4");
   await page.getByText("1 option changed").waitFor();
   await page.getByRole("button", { name: "Measure again" }).click();
-  const job = await until("the new job is there", 10_000, async () => {
+  const job = await soon("the new job is there", async () => {
     const { items } = await getJson(server, `/api/jobs?run=${done.id}`);
     return items.length === 2 && items[0];
   });
@@ -46,7 +46,7 @@ test("measuring again with one option changed, and the two side by side", async 
   assert.deepEqual((await difference.getByRole("cell").allTextContents())[0], "4");
   const views = () => page.locator(".map-top").evaluateAll((maps) => maps.map((map) => ({ ...map.striaMap.view })));
   await page.getByRole("button", { name: "Zoom in" }).first().click();
-  await until("both maps moved together", 5000, async () => {
+  await soon("both maps moved together", async () => {
     const [left, right] = await views();
     return Math.abs(left.mm_per_css_px - right.mm_per_css_px) < 1e-9 && Math.abs(left.x_mm - right.x_mm) < 1e-6;
   });
@@ -81,7 +81,7 @@ test("what could not be measured says why, and can be tried again", async () => 
   const worker = page.getByRole("region", { name: "Workers" }).getByRole("listitem");
   await worker.getByText(/of \d+ places taken/).first().waitFor();
   await row.getByRole("button", { name: "Try again" }).click();
-  await until("it was tried again", 30_000, async () => {
+  await soon("it was tried again", async () => {
     const now = await getJson(server, `/api/jobs/${sent.job.id}`);
     return now.state === "failed" && now.finished_at !== failed.finished_at;
   });
@@ -135,18 +135,18 @@ test("a batch is paused, goes on, and is cancelled for good", async () => {
   await batches.getByRole("button", { name: "Count the runs" }).click();
   await batches.getByRole("button", { name: "Measure 1 run again" }).click();
   const row = batches.getByRole("listitem").filter({ hasText: "steered" });
-  const job = await until("the batch has its job", 20_000, async () => (await getJson(idle, `/api/jobs?run=${waiting.id}`)).items.find(({ batch }) => batch));
-  const stateIs = (state) => until(`its job is ${state}`, 20_000, async () => (await getJson(idle, `/api/jobs/${job.id}`)).state === state);
+  const job = await soon("the batch has its job", async () => (await getJson(idle, `/api/jobs?run=${waiting.id}`)).items.find(({ batch }) => batch));
+  const stateIs = (state) => soon(`its job is ${state}`, async () => (await getJson(idle, `/api/jobs/${job.id}`)).state === state);
   await row.getByRole("button", { name: "Pause" }).click();
-  await row.getByText("Paused", { exact: true }).waitFor({ timeout: 20_000 });
+  await row.getByText("Paused", { exact: true }).waitFor();
   await row.getByText("1 held back").waitFor();
   await stateIs("paused");
   await row.getByRole("button", { name: "Go on" }).click();
-  await row.getByText("1 waiting").waitFor({ timeout: 20_000 });
+  await row.getByText("1 waiting").waitFor();
   await stateIs("queued");
   await row.getByRole("button", { name: "Cancel" }).click();
   await page.getByRole("dialog").getByRole("button", { name: "Cancel the batch" }).click();
-  await row.getByText("Cancelled", { exact: true }).waitFor({ timeout: 20_000 });
+  await row.getByText("Cancelled", { exact: true }).waitFor();
   await stateIs("cancelled");
   assert.equal(await row.getByRole("button").count(), 0, "a cancelled batch cannot go on");
   await close();
@@ -176,13 +176,13 @@ test("a rig is drawn and checked before it is stored", async () => {
 test("the path's plots and every file of a finished run", async () => {
   const { page, close } = await openPage(browser, server);
   await page.goto(`/runs/${done.id}?tab=path`);
-  await until("six plots are drawn", 10_000, async () => (await page.locator(".plot canvas").count()) === 6);
+  await soon("six plots are drawn", async () => (await page.locator(".plot canvas").count()) === 6);
   const trajectory = await getJson(server, `/api/jobs/${done.job.id}/trajectory`);
   assert.equal(trajectory.columns.frame.length, trajectory.frames);
   await page.getByRole("tab", { name: "Files" }).click();
   await page.getByRole("link", { name: "Download depth.tif" }).waitFor();
   await page.getByRole("tab", { name: "Files" }).press("ArrowRight");
   const focused = () => page.evaluate(() => document.activeElement.textContent);
-  await until("the arrow has gone on to the next part", 5_000, async () => (await focused()) === "Measurements");
+  await soon("the arrow has gone on to the next part", async () => (await focused()) === "Measurements");
   await close();
 });

@@ -22,7 +22,7 @@ export function LightView({ job }: { job: Job }) {
           {open ? words.lightClose : words.lightOpen}
         </button>
       </p>
-      {open && <Open job={job} />}
+      {open && <Open key={job.id} job={job} />}
     </section>
   );
 }
@@ -56,7 +56,7 @@ function Cloud({ points }: { points: Points }) {
     if (element === null) return undefined;
     let scene: Scene;
     try {
-      scene = new Scene(element, points);
+      scene = new Scene(element, points, () => draw.current());
     } catch {
       setFailed(true);
       return undefined;

@@ -42,23 +42,41 @@ export const START: Camera = { turn: 0.35, tilt: 0.35, distance: 1.5, shift: [0,
 
 export class Scene {
   private readonly gl: WebGLRenderingContext;
-  private readonly program: WebGLProgram;
-  private readonly count: number;
+  private program: WebGLProgram | null = null;
+  private readonly stopped = new AbortController();
 
-  /** Throws where WebGL is not to be had. */
+  /** `changed` is called when there is reason to draw again. Throws where WebGL is not to be had. */
   constructor(
     private readonly canvas: HTMLCanvasElement,
     private readonly points: Points,
+    changed: () => void,
   ) {
     const gl = canvas.getContext("webgl", { antialias: false, preserveDrawingBuffer: true });
     if (gl === null) throw new Error("no WebGL");
     this.gl = gl;
-    this.count = points.count;
-    this.program = programOf(gl);
-    gl.useProgram(this.program);
+    this.load();
+    // A graphics driver that was reset, or a browser short of contexts, takes everything; it gives the context back when asked to.
+    const { signal } = this.stopped;
+    canvas.addEventListener("webglcontextlost", (event) => event.preventDefault(), { signal });
+    canvas.addEventListener(
+      "webglcontextrestored",
+      () => {
+        this.load();
+        changed();
+      },
+      { signal },
+    );
+  }
+
+  /** Hands shaders, points and colours to the graphics card; nothing while it has lost the context. */
+  private load(): void {
+    const { gl, points } = this;
+    const program = programOf(gl);
+    if (gl.isContextLost()) return;
+    gl.useProgram(program);
     gl.bindBuffer(gl.ARRAY_BUFFER, gl.createBuffer());
     gl.bufferData(gl.ARRAY_BUFFER, points.positions, gl.STATIC_DRAW);
-    const place = gl.getAttribLocation(this.program, "place");
+    const place = gl.getAttribLocation(program, "place");
     gl.enableVertexAttribArray(place);
     gl.vertexAttribPointer(place, 3, gl.FLOAT, false, 0, 0);
     const ramp = new Uint8Array(256 * 4);
@@ -69,17 +87,19 @@ export class Scene {
     gl.texParameteri(gl.TEXTURE_2D, gl.TEXTURE_WRAP_S, gl.CLAMP_TO_EDGE);
     gl.texParameteri(gl.TEXTURE_2D, gl.TEXTURE_WRAP_T, gl.CLAMP_TO_EDGE);
     gl.enable(gl.DEPTH_TEST);
+    this.program = program;
   }
 
   draw(camera: Camera): void {
-    const { gl, canvas, points } = this;
+    const { gl, canvas, points, program } = this;
+    if (program === null || gl.isContextLost()) return;
     const ratio = Math.min(window.devicePixelRatio || 1, 2);
     const [width, height] = [Math.round(canvas.clientWidth * ratio), Math.round(canvas.clientHeight * ratio)];
     if (canvas.width !== width || canvas.height !== height) [canvas.width, canvas.height] = [width, height];
     gl.viewport(0, 0, width, height);
     gl.clearColor(0, 0, 0, 0);
     gl.clear(gl.COLOR_BUFFER_BIT | gl.DEPTH_BUFFER_BIT);
-    const at = (name: string) => gl.getUniformLocation(this.program, name);
+    const at = (name: string) => gl.getUniformLocation(program, name);
     gl.uniform3f(at("middle"), ...points.middle);
     gl.uniform1f(at("radius"), points.radius);
     gl.uniform1f(at("exaggeration"), camera.exaggeration);
@@ -88,13 +108,14 @@ export class Scene {
     gl.uniform1f(at("distance"), camera.distance);
     gl.uniform1f(at("aspect"), width / Math.max(height, 1));
     // Points as large as their distance to each other, so that the surface closes.
-    gl.uniform1f(at("size"), (height * 2.4) / Math.sqrt(this.count));
+    gl.uniform1f(at("size"), (height * 2.4) / Math.sqrt(points.count));
     gl.uniform2f(at("shift"), ...camera.shift);
     gl.uniform2f(at("range"), ...points.range);
-    gl.drawArrays(gl.POINTS, 0, this.count);
+    gl.drawArrays(gl.POINTS, 0, points.count);
   }
 
   close(): void {
+    this.stopped.abort();
     this.gl.getExtension("WEBGL_lose_context")?.loseContext();
   }
 }
@@ -106,13 +127,13 @@ function programOf(gl: WebGLRenderingContext): WebGLProgram {
     [gl.FRAGMENT_SHADER, FRAGMENT],
   ] as const) {
     const shader = gl.createShader(kind);
-    if (shader === null) throw new Error("no shader");
+    // There is none where the context was lost meanwhile.
+    if (shader === null) break;
     gl.shaderSource(shader, source);
     gl.compileShader(shader);
-    if (!gl.getShaderParameter(shader, gl.COMPILE_STATUS)) throw new Error(gl.getShaderInfoLog(shader) ?? "a shader does not compile");
     gl.attachShader(program, shader);
   }
   gl.linkProgram(program);
-  if (!gl.getProgramParameter(program, gl.LINK_STATUS)) throw new Error(gl.getProgramInfoLog(program) ?? "the shaders do not link");
+  if (!gl.getProgramParameter(program, gl.LINK_STATUS) && !gl.isContextLost()) throw new Error(gl.getProgramInfoLog(program) ?? "the shaders do not link");
   return program;
 }
