@@ -21,8 +21,10 @@ const CLEAR_SHARE: f64 = 0.8;
 /// Once a frame is chosen, its places may lie nearer to the laser: this share of the margin. Else just those would be left out
 /// whose spots are drawn aside by what the wall should tell.
 const CHOSEN_MARGIN: f32 = 0.8;
-/// Share that counts as all of it.
-const ALL_CLEAR_SHARE: f64 = 0.96;
+/// Share that counts as all of it: of the places that are looked at, one may have left the image at its rim.
+const ALL_CLEAR_SHARE: f64 = 0.95;
+/// Places of a profile that are looked at.
+const PROBES: usize = 24;
 
 /// A frame that may show the wall without the laser.
 pub(super) struct Recent {
@@ -75,9 +77,9 @@ impl Recent {
 
     /// The share of a profile's places that it shows clear of the laser.
     fn clear_share(&self, rig: &Rig, profile: &Profile, world_from_camera: &WorldFromCamera, margin_px: f32) -> f64 {
-        let step = (profile.points.len() / 24).max(1);
+        let step = (profile.points.len() / PROBES).max(1);
         let (mut all, mut clear) = (0_u32, 0_u32);
-        for point in profile.points.iter().step_by(step) {
+        for point in profile.points.iter().skip(step / 2).step_by(step) {
             let world = world_from_camera * point.point_in_camera;
             all += 1;
             clear += u32::from(self.clear_place(&rig.camera, &world, margin_px).is_some());

@@ -48,6 +48,8 @@ const PIECE_MIN_GROUPS: usize = 2;
 const LINE_REACH: usize = 10;
 /// What the wall's pattern, divided out, leaves of a spot's σ: it was most of the error (measured on simulated concrete).
 const DIVIDED_SIGMA: f32 = 0.6;
+/// Turns in which the first frame teaches the line's cross-section.
+const FIRST_TURNS: usize = 6;
 /// A spot laid on the line's cross-section lies no further from its centroid than this, widths of the line.
 const LAID_ON_WIDTHS: f32 = 0.5;
 /// The line goes on from one row to the next where the row before lies this near to where the colour is, px.
@@ -245,8 +247,8 @@ impl StripeMeasurer {
     fn lay_on(&mut self, seen: &Seen, stripe: &mut Stripe) {
         self.shape.expect(seen.shape.width_px);
         let largest_px = LAID_ON_WIDTHS * seen.shape.width_px;
-        // The first frame teaches by its centroids.
-        for _ in 0..if self.shape.is_known() { 1 } else { 2 } {
+        // The first frame teaches by its centroids, then by what was learned.
+        for _ in 0..if self.shape.is_known() { 1 } else { FIRST_TURNS } {
             for (position, profile) in self.divided.chunks_exact(seen.samples()).enumerate() {
                 if !profile[0].is_finite() {
                     continue;
