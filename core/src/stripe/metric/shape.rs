@@ -33,12 +33,12 @@ const STEPS: usize = 4;
 const HOLD: f32 = 1e-4;
 /// A sample's error as shares of the height: always; of its own light, for the wall's pattern; and in the core, from the
 /// one to the other share of the height.
-const ERROR: f32 = 0.05;
-const PATTERN_ERROR: f32 = 0.10;
+const ERROR: f32 = 0.03;
+const PATTERN_ERROR: f32 = 0.12;
 const CORE_ERROR: f32 = 0.5;
 const CORE_FROM: (f32, f32) = (0.7, 0.9);
 /// What a spot on a plain wall leaves of these errors: they are wide so that no sample has all the say.
-const USUAL_MISFIT: f32 = 0.33;
+const USUAL_MISFIT: f32 = 0.6;
 /// Turns in which a spot is laid on; the last one moves it by a hundredth of a pixel.
 const TURNS: usize = 2;
 
