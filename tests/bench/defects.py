@@ -1,6 +1,6 @@
 """What the search for defects finds on simulated runs whose features are known, and what two runs show of a change.
 
-    defects.py [--quick] [--stria FILE] [--work FOLDER]
+    defects.py [--quick | --many] [--stria FILE] [--work FOLDER]
 
 Simulates runs (other seeds than the tests'), processes them and judges `defects.json`, `change.json` and the pipe's section
 against the truth. A feature counts where its whole disc could be measured: the share of the disc that the true measurable
@@ -56,6 +56,14 @@ SCENES = (
     Scene("oval pipe, gait", "pipe-oval", "--seconds 4 --fps 60 --seed 41"),
     Scene("oval pipe, rail", "pipe-oval", "--seconds 4 --motion steady --seed 42"),
 )
+MANY = (
+    ("wall, 1280x720", tuple(Scene(f"wall {s}", "wall", f"--seconds 8 --seed {s}") for s in range(201, 207))),
+    ("wall, 640x360", tuple(Scene(f"wall {s}", "wall", f"--seconds 8 --seed {s} --size 640x360") for s in range(301, 307))),
+    ("wall, 1920x1080", tuple(Scene(f"wall {s}", "wall", f"--seconds 5 --seed {s} --size 1920x1080") for s in range(401, 405))),
+    ("pipe, gait, 1280x720", tuple(Scene(f"pipe {s}", "pipe", f"--seconds 6 --fps 60 --seed {s}") for s in range(501, 505))),
+    ("pipe, gait, 640x360", tuple(Scene(f"pipe {s}", "pipe", f"--seconds 6 --fps 60 --seed {s} --size 640x360") for s in (601, 602))),
+)
+"""More runs of a kind, judged together: what a dozen features cannot tell."""
 QUICK = ("wall", "pipe, gait", "sound wall")
 AGED = (
     Scene("first", "wall", "--seconds 4 --seed 61 --wall-seed 7"),
@@ -179,6 +187,19 @@ def summary_row(name: str, result: dict) -> list[str]:
     ]
 
 
+def many_row(name: str, results: list[dict]) -> list[str]:
+    """What was found of all features of several runs."""
+    due = [row for result in results for row in result["rows"] if row["due"]]
+    found = [row for row in due if row["found"]]
+    held = [good(row) for row in found]
+    off = [errors(row)[0] for row in found]
+    false = sum(len(result["false"]) for result in results)
+    length_m = sum(result["length_mm"] for result in results) / 1000
+    counts = [str(sum(h[i] for h in held)) for i in range(3)]
+    return [name, str(len(due)), str(len(found)), *counts, number(float(np.std(off)), 2), f"{false} in {length_m:.1f} m"]
+
+
+MANY_SUMMARY = ["runs", "features", "found", "depth within", "area within", "place within", "depth off, deviation, mm", "false"]
 SUMMARY = [
     "run", "found", "depth", "area", "place", "depth off, median mm", "largest, mm", "within 2 deviations", "false",
     "limit at 20 mm, mm", "ms a frame",
@@ -225,11 +246,16 @@ def changes(bench: Bench) -> Table:
 def main() -> int:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--quick", action="store_true", help="three scenes, no change between runs")
+    parser.add_argument("--many", action="store_true", help="22 more runs, judged together by kind and size, instead")
     parser.add_argument("--stria", type=Path, default=ROOT / "target/release/stria")
     parser.add_argument("--work", type=Path, default=ROOT / "target/bench/defects", help="where runs are kept for the next time")
     asked = parser.parse_args()
     try:
         bench = Bench(asked.stria, asked.work)
+        if asked.many:
+            rows = [many_row(name, [judged(*made(bench, scene)) for scene in scenes]) for name, scenes in MANY]
+            print(Table("Defects over many runs", MANY_SUMMARY, rows).text())
+            return 0
         results = {s.name: judged(*made(bench, s)) for s in SCENES if not asked.quick or s.name in QUICK}
         tables = [feature_table(name, result) for name, result in results.items() if any(r["due"] for r in result["rows"])]
         tables.append(Table("Defects", SUMMARY, [summary_row(name, result) for name, result in results.items()]))
