@@ -15,6 +15,7 @@ WORK/bench.md (tables ready for the README) and WORK/bench.json (every figure):
 """
 
 import argparse
+import contextlib
 import json
 import os
 import resource
@@ -23,6 +24,7 @@ import statistics
 import subprocess
 import sys
 import time
+from collections.abc import Iterator
 from pathlib import Path
 
 try:
@@ -56,37 +58,48 @@ BUSY_SHARE = 0.1
 PARTS = ("speed", "memory", "accuracy", "exports")
 
 
+class Clock:
+    """Times in s of what runs under a name, round by round; of the processor, what all cores together spent."""
+
+    def __init__(self) -> None:
+        self.all_s: dict[str, list[float]] = {}
+        self.cpu_s: dict[str, list[float]] = {}
+
+    @contextlib.contextmanager
+    def times(self, name: str) -> Iterator[None]:
+        begun, cpu_before_s = time.perf_counter(), children_cpu_s()
+        yield
+        self.all_s.setdefault(name, []).append(time.perf_counter() - begun)
+        self.cpu_s.setdefault(name, []).append(children_cpu_s() - cpu_before_s)
+
+    def said(self) -> dict:
+        """Every wall time, and the medians of wall and processor times."""
+        return {
+            "all_s": self.all_s,
+            "median_s": {name: statistics.median(times) for name, times in self.all_s.items()},
+            "cpu_s": {name: statistics.median(times) for name, times in self.cpu_s.items()},
+        }
+
+
 def speed(bench: Bench, scenes: list[Scene], methods: list[str], rounds: int) -> dict:
-    """Times in s of everything on each scene, round by round: name → {frames, all_s, median_s, cpu_s, timings_s};
-    cpu_s: the median of what all cores together spent."""
+    """Times in s of everything on each scene, round by round: name → {frames, all_s, median_s, cpu_s, timings_s}."""
     results = {}
     for scene in scenes:
-        run = bench.run(scene)
-        all_s: dict[str, list[float]] = {}
-        cpu_s: dict[str, list[float]] = {}
+        run, clock = bench.run(scene), Clock()
         timings_s: dict[str, dict] = {}
         for k in range(rounds):
             say(f"speed on {scene.name}, round {k + 1} of {rounds}")
-            begun, cpu_before_s = time.perf_counter(), children_cpu_s()
-            call(["ffmpeg", "-v", "error", "-i", run / "video.mp4", "-f", "null", "-"], "ffmpeg")
-            all_s.setdefault("decoding", []).append(time.perf_counter() - begun)
-            cpu_s.setdefault("decoding", []).append(children_cpu_s() - cpu_before_s)
+            with clock.times("decoding"):
+                decode(run / "video.mp4")
             for method in methods:
                 for few, kind in ((True, "few"), (False, "all")):
-                    cpu_before_s = children_cpu_s()
-                    out, seconds = bench.process(run, method, few)
-                    all_s.setdefault(f"{method}, {kind}", []).append(seconds)
-                    cpu_s.setdefault(f"{method}, {kind}", []).append(children_cpu_s() - cpu_before_s)
+                    with clock.times(f"{method}, {kind}"):
+                        out = bench.process(run, method, few)
                     timings_s[method] = json.loads((out / "manifest.json").read_text())["timings_s"]
                     shutil.rmtree(out)
-            all_s.setdefault("yardstick", []).append(yardstick_s(bench, run))
-        results[scene.name] = {
-            "frames": len(np.load(run / "truth" / "stripes.npy", mmap_mode="r")),
-            "all_s": all_s,
-            "median_s": {name: statistics.median(times) for name, times in all_s.items()},
-            "cpu_s": {name: statistics.median(times) for name, times in cpu_s.items()},
-            "timings_s": timings_s,
-        }
+            clock.all_s.setdefault("yardstick", []).append(yardstick_s(bench, run))
+        frames = len(np.load(run / "truth" / "stripes.npy", mmap_mode="r"))
+        results[scene.name] = {"frames": frames, **clock.said(), "timings_s": timings_s}
     return results
 
 
@@ -94,30 +107,24 @@ def long_speed(bench: Bench, scenes: list[Scene], rounds: int) -> dict:
     """As speed(), on a minute of video of each scene, without what takes minutes for it."""
     results = {}
     for scene in scenes:
-        run = bench.run(scene)
+        run, clock = bench.run(scene), Clock()
         video = bench.long_video(run, LONG_S, straight=False)
-        all_s: dict[str, list[float]] = {}
-        cpu_s: dict[str, list[float]] = {}
         for k in range(rounds):
             say(f"speed on {LONG_S} s of {scene.name}, round {k + 1} of {rounds}")
-            for name, few in (("decoding", None), ("metric, few", True), ("metric, all", False)):
-                begun, cpu_before_s = time.perf_counter(), children_cpu_s()
-                if few is None:
-                    call(["ffmpeg", "-v", "error", "-i", video, "-f", "null", "-"], "ffmpeg")
-                else:
-                    out, _ = bench.process(run, "metric", few, video=video)
-                all_s.setdefault(name, []).append(time.perf_counter() - begun)
-                cpu_s.setdefault(name, []).append(children_cpu_s() - cpu_before_s)
-                if few is not None:
-                    frames = json.loads((out / "manifest.json").read_text())["quality"]["frames"]
-                    shutil.rmtree(out)
-        results[scene.name] = {
-            "frames": frames,
-            "all_s": all_s,
-            "median_s": {name: statistics.median(times) for name, times in all_s.items()},
-            "cpu_s": {name: statistics.median(times) for name, times in cpu_s.items()},
-        }
+            with clock.times("decoding"):
+                decode(video)
+            for few, kind in ((True, "few"), (False, "all")):
+                with clock.times(f"metric, {kind}"):
+                    out = bench.process(run, "metric", few, video=video)
+                frames = json.loads((out / "manifest.json").read_text())["quality"]["frames"]
+                shutil.rmtree(out)
+        results[scene.name] = {"frames": frames, **clock.said()}
     return results
+
+
+def decode(video: Path) -> None:
+    """Decodes all of a video and keeps nothing."""
+    call(["ffmpeg", "-v", "error", "-i", video, "-f", "null", "-"], "ffmpeg")
 
 
 def children_cpu_s() -> float:
@@ -158,12 +165,12 @@ def accuracy(bench: Bench, scenes: list[Scene], methods: list[str]) -> list[dict
             say(f"accuracy of `{method}` on {scene.name}")
             result: dict = {"scene": scene.name, "method": method}
             try:
-                out, _ = bench.process(run, method, True, "--set", "stripe.keep=true")
+                out = bench.process(run, method, True, "--set", "stripe.keep=true")
                 result["figures"] = evaluate(truth, read_products(out))
                 shutil.rmtree(out)
                 # The publication's way has no place for a pose.
                 if scene.name in JITTER_SCENES and method != "paper":
-                    out, _ = bench.process(run, method, True, "--poses", run / "truth" / "trajectory.csv")
+                    out = bench.process(run, method, True, "--poses", run / "truth" / "trajectory.csv")
                     result["figures"]["jitter_true_poses_mm"] = evaluate(truth, read_products(out))["jitter_mm"]
                     shutil.rmtree(out)
             except BenchError as error:

@@ -46,7 +46,7 @@ def long_cloud(short: Path, long: Path, frames: int) -> int:
 def exports(bench: Bench, scene: Scene, minutes: int) -> dict:
     """The archive of a run, and size, time and peak memory of each export of a cloud of so many minutes."""
     run = bench.run(scene)
-    products, _ = bench.process(run, bench.recipes[0], few=False)
+    products = bench.process(run, bench.recipes[0], few=False)
     manifest = json.loads((products / "manifest.json").read_text())
     seconds = manifest["quality"]["duration_s"]
     archive = {

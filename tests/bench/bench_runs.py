@@ -110,17 +110,13 @@ class Bench:
         command = [self.stria, "process", video, "--rig", rig, "--recipe", method, "--out", out]
         return command + (["--only", FEW] if few else [])
 
-    def process(
-        self, run: Path, method: str, few: bool, *more: str | Path, video: Path | None = None
-    ) -> tuple[Path, float]:
-        """Processes a run, or another video of its rig, with `more` on the command line; its product folder and the wall
-        time in seconds."""
+    def process(self, run: Path, method: str, few: bool, *more: str | Path, video: Path | None = None) -> Path:
+        """Processes a run, or another video of its rig, with `more` on the command line; its product folder."""
         out = self.work / "products" / f"{run.name}-{method}{'-few' if few else ''}"
         shutil.rmtree(out, ignore_errors=True)
         command = [*self.process_command(video or run / "video.mp4", run / "rig.toml", method, out, few), *more]
-        begun = time.perf_counter()
         call(command, f"`{method}` on {run.name}", DONE)
-        return out, time.perf_counter() - begun
+        return out
 
     def peak_memory(self, video: Path, rig: Path, method: str) -> dict:
         """Processes a video into all products; frames, wall time in s and peak memory in MB."""

@@ -42,6 +42,14 @@ const OFF_COLOUR_PX: f32 = 3.0;
 const OFF_COLOUR_WIDTHS: f32 = 0.4;
 /// Standard deviation of a place that only the colour tells, px: chroma has half the image's size.
 const COLOUR_SIGMA_PX: f32 = 2.0;
+/// Error of a spot's centre, widths of the line, where the wall on one side is so many chroma levels poorer in the laser's
+/// colour than on the other: paint that swallows the laser begins there. It grows with the square up to the greatest.
+const PAINT: f32 = 0.3;
+const PAINT_LEVELS: f32 = 40.0;
+const PAINT_MOST: f32 = 1.5;
+/// The wall beside the line begins so far from its middle, widths of the line and px: the chroma smears the line's colour.
+const BESIDE_WIDTHS: f32 = 1.2;
+const BESIDE_PX: f32 = 2.0;
 /// Shortest piece of the line that the colour is believed in, groups; the spots themselves then need more.
 const PIECE_MIN_GROUPS: usize = 2;
 /// Groups on each side that say where the line goes on.
@@ -190,10 +198,17 @@ impl StripeFinder {
                 None => continue,
             };
             seen.stripe.across_px[position] = at;
-            seen.stripe.sigma_px[position] = sigma;
+            seen.stripe.sigma_px[position] = sigma + self.paint_px(position, at, width_px);
             seen.stripe.confidence[position] = height.min(1.0);
         }
         seen
+    }
+
+    /// What the edge of paint does to a spot's centre, px: the paint's luma may be as the wall's, but the laser's light is not.
+    fn paint_px(&self, position: usize, across_px: f32, width_px: f32) -> f32 {
+        let poorer =
+            self.scratch.poorer_side(position / GROUP, across_px, BESIDE_WIDTHS * width_px + BESIDE_PX) / PAINT_LEVELS;
+        PAINT * width_px * poorer.min(PAINT_MOST).powi(2)
     }
 }
 

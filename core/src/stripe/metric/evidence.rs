@@ -19,6 +19,8 @@ const WIDE_PX: f32 = 14.0;
 const SKIP: usize = 32;
 /// Peaks closer than this are one, cells.
 const PEAK_DISTANCE: usize = 6;
+/// Cells that tell the colour of the wall beside the line.
+const SIDE_CELLS: usize = 3;
 /// Candidates of one group, at most: the strongest.
 const MAX_CANDIDATES: usize = 8;
 
@@ -64,6 +66,26 @@ pub(super) struct Scratch {
     field: Field,
     prefix: Vec<i32>,
     response: Vec<f32>,
+}
+
+impl Scratch {
+    /// How much poorer in the laser's colour than gray one side of a place is than the other, in chroma levels: red paint
+    /// swallows green light. 0 where neither side is poorer than gray, and where one is not in the image.
+    /// The sides begin `away_px` from the place.
+    pub(super) fn poorer_side(&self, group: usize, across_px: f32, away_px: f32) -> f32 {
+        let Field { values, groups, cells, samples } = &self.field;
+        let side = |first_px: f32| {
+            let first = (first_px / CELL_PX as f32).round();
+            let inside = group < *groups && first >= 0.0 && first as usize + SIDE_CELLS <= *cells;
+            let side = inside.then(|| &values[group * cells + first as usize..][..SIDE_CELLS])?;
+            Some(side.iter().map(|value| f32::from(*value)).sum::<f32>() / (SIDE_CELLS * samples) as f32)
+        };
+        let width_px = (SIDE_CELLS * CELL_PX) as f32;
+        match (side(across_px - away_px - width_px), side(across_px + away_px)) {
+            (Some(left), Some(right)) => left.max(right).min(0.0) - left.min(right).min(0.0),
+            _ => 0.0,
+        }
+    }
 }
 
 /// The difference between a box and the greater of its two neighbours; keeps the larger of what is there and this.

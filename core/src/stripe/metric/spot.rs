@@ -19,6 +19,10 @@ const PATTERN_SHARE: f32 = 0.08;
 const NOISE_LIGHT: f32 = 0.004;
 /// Error of the centre in widths of the line where the two sides differ by as much light as the line has.
 const GLARE: f32 = 0.12;
+/// Error of the centre in widths of the line where the light a width away is as bright as the line, and by how much of its
+/// height the line's top stands above that light on a plain wall.
+const SHOULDER: f32 = 0.085;
+const PLAIN_SHOULDER: f32 = 0.85;
 /// Rows between those that tell how much of the pattern is noise.
 const PROBE_STEP: usize = 8;
 /// Noise that the softening leaves, as a share of what it takes away: 0.10 of white noise's power against 0.73.
@@ -76,7 +80,7 @@ impl SpotShape {
         let middle = (profile.len() / 2) as f32;
         ((at - middle).abs() < self.half as f32 - SIDE as f32).then(|| Spot {
             at,
-            sigma: self.sigma_px(light) + self.glare_px(left, right, height),
+            sigma: self.sigma_px(light) + self.glare_px(left, right, height) + self.shoulder_px(profile, at, height),
             height,
             background: (left + right) / 2.0,
         })
@@ -112,12 +116,19 @@ impl SpotShape {
         GLARE * self.width_px * lopsided * lopsided
     }
 
+    /// What a highlight beside the line does to the centre, px. At its edge the two are one bright patch, in the middle of
+    /// which the centroid lies: light a line's width away that is as bright as the line gives it away.
+    fn shoulder_px(&self, profile: &[f32], at: f32, height: f32) -> f32 {
+        let shoulder = light_at(profile, at - self.width_px).max(light_at(profile, at + self.width_px));
+        let stands = (light_at(profile, at) - shoulder) / height.max(1e-3);
+        SHOULDER * self.width_px * (1.0 - stands / PLAIN_SHOULDER).clamp(0.0, 1.0)
+    }
+
     /// Width at half height around a centre, px.
     pub(super) fn width_px(&self, profile: &[f32], at: f32) -> Option<f32> {
         let (left, right) = (side(&profile[..SIDE]), side(&profile[profile.len() - SIDE..]));
         let background = (left + right) / 2.0;
-        let middle = (at.round().max(1.0) as usize).min(profile.len() - 2);
-        let top = profile[middle - 1..=middle + 1].iter().sum::<f32>() / 3.0;
+        let top = light_at(profile, at);
         let half = (top + background) / 2.0;
         let crossing = |mut i: usize, step: isize| -> Option<f32> {
             loop {
@@ -129,6 +140,7 @@ impl SpotShape {
                 i = next;
             }
         };
+        let middle = middle_sample(profile, at);
         (top > background).then(|| Some(crossing(middle, 1)? - crossing(middle, -1)?)).flatten()
     }
 
@@ -198,6 +210,17 @@ fn lane_sums(window: &[f32], first_d: f32, reach: f32, level_at: f32, slope: f32
         }
     }
     (light.iter().sum(), moment.iter().sum())
+}
+
+/// The sample at a place that has one on each side.
+fn middle_sample(profile: &[f32], at: f32) -> usize {
+    (at.round().max(1.0) as usize).min(profile.len() - 2)
+}
+
+/// Light at a place: the mean of three samples.
+fn light_at(profile: &[f32], at: f32) -> f32 {
+    let middle = middle_sample(profile, at);
+    profile[middle - 1..=middle + 1].iter().sum::<f32>() / 3.0
 }
 
 /// Light of a side: the mean without the least and the greatest, which may be specks.

@@ -12,6 +12,11 @@ const HEIGHT: usize = 160;
 /// Lines of a colour (blue, green, red; 1 is as bright as white) on a gray wall of that light, each at a column in row 0
 /// and a tenth of a pixel further each row; in an sRGB image, clipped at white.
 fn image(lines: &[(f64, [f64; 3])], wall: f64) -> Image {
+    image_on(lines, |_, _| wall)
+}
+
+/// The same on a wall whose light is told for each row and column.
+fn image_on(lines: &[(f64, [f64; 3])], wall: impl Fn(usize, usize) -> f64) -> Image {
     let encode = |light: f64| {
         let light = light.min(1.0);
         let value = if light <= 0.0031308 { 12.92 * light } else { 1.055 * light.powf(1.0 / 2.4) - 0.055 };
@@ -20,7 +25,7 @@ fn image(lines: &[(f64, [f64; 3])], wall: f64) -> Image {
     let mut bgr = Vec::with_capacity(3 * WIDTH * HEIGHT);
     for row in 0..HEIGHT {
         for column in 0..WIDTH {
-            let mut light = [wall; 3];
+            let mut light = [wall(row, column); 3];
             for (start, colour) in lines {
                 let off = column as f64 - start - 0.1 * row as f64;
                 let bell = (-off * off / (2.0 * 2.5 * 2.5)).exp();
@@ -124,5 +129,24 @@ fn a_step_of_the_line_stays_sharp() {
         let start = if row < HEIGHT / 2 { 200.0 } else { 212.0 };
         let off = (f64::from(*x) - start - 0.1 * row as f64).abs();
         assert!(off < 0.15, "row {row}: off by {off} px");
+    }
+}
+
+#[test]
+fn what_a_highlight_draws_aside_is_not_said_to_be_sure() {
+    let highlight = |row: usize, column: usize| {
+        let (down, aside) = ((row as f64 - 80.0) / 14.0, (column as f64 - 195.0) / 6.0);
+        0.15 + 3.0 * (-0.5 * (down * down + aside * aside)).exp()
+    };
+    let found = stripe(
+        &image_on(&[(200.3, [0.6, 6.0, 0.4])], highlight),
+        LaserColour::Green,
+        LineDirection::Vertical,
+        &SpotOptions::default(),
+    );
+    assert!(found.found() > HEIGHT / 2, "{} rows", found.found());
+    for (row, (x, sigma)) in found.across_px.iter().zip(&found.sigma_px).enumerate() {
+        let off = (f64::from(*x) - 200.3 - 0.1 * row as f64).abs();
+        assert!(x.is_nan() || off < 0.1 + 3.0 * f64::from(*sigma), "row {row}: off by {off} px, σ {sigma} px");
     }
 }

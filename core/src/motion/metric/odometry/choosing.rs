@@ -6,10 +6,13 @@ use super::super::bundle::{PlaceDepth, PlaceSight};
 use super::super::depth::{self, Known};
 use super::super::landmark::{Landmark, best_place};
 use super::super::view::FrameView;
-use super::{Odometry, SIGMA_PX, SURE_SHARE};
+use super::{Odometry, SIGMA_PX};
 use crate::geometry::RawPixel;
 use crate::rig::LineDirection;
 use crate::triangulation::Profile;
+
+/// A depth known better than this share is one that neighbours may rely on.
+const SURE_SHARE: f64 = 0.01;
 
 impl Odometry {
     /// New landmarks where the image has none.

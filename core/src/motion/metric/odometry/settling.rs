@@ -3,7 +3,10 @@
 use nalgebra::Isometry3;
 
 use super::super::pose::{self, Sight};
-use super::{DORMANT, FEWEST_SIGHTS, HOLD_FIRM_RAD, HOLD_RAD, Odometry, SettledPose, Waiting, hold};
+use super::{FEWEST_SIGHTS, HOLD_FIRM_RAD, HOLD_RAD, Odometry, SettledPose, Waiting, hold};
+
+/// Landmarks out of view that are kept for a robot that comes back.
+const DORMANT: usize = 300;
 
 impl Odometry {
     pub(super) fn wait(
