@@ -22,7 +22,7 @@ mod spot;
 use std::sync::mpsc::{Receiver, Sender, channel};
 
 use crate::recipe::SpotOptions;
-use crate::rig::{Laser, LineDirection};
+use crate::rig::{Laser, LaserColour, LineDirection};
 use crate::source::{PlaneView, Yuv};
 use crate::stripe::Stripe;
 use crate::stripe::choice::{self, Candidate};
@@ -43,10 +43,19 @@ const OFF_COLOUR_WIDTHS: f32 = 0.4;
 /// Standard deviation of a place that only the colour tells, px: chroma has half the image's size.
 const COLOUR_SIGMA_PX: f32 = 2.0;
 /// Error of a spot's centre, widths of the line, where the wall on one side is so many chroma levels poorer in the laser's
-/// colour than on the other: paint that swallows the laser begins there. It grows with the square up to the greatest.
+/// colour than gray, or richer, and on the other is not: paint that swallows the laser begins there, or a lamp's glow. It
+/// grows with the square of the levels, up to the greatest.
 const PAINT: f32 = 0.3;
-const PAINT_LEVELS: f32 = 40.0;
-const PAINT_MOST: f32 = 1.5;
+const LAMP: f32 = 0.05;
+const TINT_LEVELS: f32 = 40.0;
+const TINT_MOST: f32 = 1.5;
+/// Error of a spot's centre, widths of the line, where the wall beside it is as bright in the laser's colour as the sensor
+/// goes: from the first to the second light.
+const CLIPPED: f32 = 0.15;
+const CLIPPED_LIGHT: (f32, f32) = (0.85, 0.95);
+/// The laser's own colour is the luma and so much of its chroma level (see [`evidence`]): of green, red and blue, about as
+/// in all standards.
+const OWN_SHARES: [f32; 3] = [0.33, 1.5, 1.8];
 /// The wall beside the line begins so far from its middle, widths of the line and px: the chroma smears the line's colour.
 const BESIDE_WIDTHS: f32 = 1.2;
 const BESIDE_PX: f32 = 2.0;
@@ -198,17 +207,34 @@ impl StripeFinder {
                 None => continue,
             };
             seen.stripe.across_px[position] = at;
-            seen.stripe.sigma_px[position] = sigma + self.paint_px(position, at, width_px);
+            seen.stripe.sigma_px[position] = sigma + self.beside_px(luma, light, position, at, width_px);
             seen.stripe.confidence[position] = height.min(1.0);
         }
         seen
     }
 
-    /// What the edge of paint does to a spot's centre, px: the paint's luma may be as the wall's, but the laser's light is not.
-    fn paint_px(&self, position: usize, across_px: f32, width_px: f32) -> f32 {
-        let poorer =
-            self.scratch.poorer_side(position / GROUP, across_px, BESIDE_WIDTHS * width_px + BESIDE_PX) / PAINT_LEVELS;
-        PAINT * width_px * poorer.min(PAINT_MOST).powi(2)
+    /// What the wall's colours beside a spot do to its centre, px. Where paint that swallows the laser begins, its luma may
+    /// be as the wall's, but the laser's light is not; and a wall as bright in the laser's colour as the sensor goes shows
+    /// next to nothing of it.
+    fn beside_px(&self, luma: &Lines<'_>, light: &[f32; 256], position: usize, across_px: f32, width_px: f32) -> f32 {
+        let away_px = BESIDE_WIDTHS * width_px + BESIDE_PX;
+        let Some(sides) = self.scratch.sides(position / GROUP, across_px, away_px) else { return 0.0 };
+        let step = |[left, right]: [f32; 2]| ((left - right).abs() / TINT_LEVELS).min(TINT_MOST).powi(2);
+        let paint = step(sides.map(|side| side.min(0.0)));
+        let lamp = step(sides.map(|side| side.max(0.0)));
+        let own_share = OWN_SHARES[match self.laser.colour {
+            LaserColour::Green => 0,
+            LaserColour::Red => 1,
+            LaserColour::Blue => 2,
+        }];
+        let firsts = [across_px - away_px - evidence::SIDE_PX as f32, across_px + away_px];
+        let brightest = sides.iter().zip(firsts).map(|(side, first)| {
+            let value = luma.mean(position, first, evidence::SIDE_PX) + own_share * side;
+            light[value.clamp(0.0, 255.0) as usize]
+        });
+        let clipped =
+            ((brightest.fold(0.0, f32::max) - CLIPPED_LIGHT.0) / (CLIPPED_LIGHT.1 - CLIPPED_LIGHT.0)).clamp(0.0, 1.0);
+        (PAINT * paint + LAMP * lamp + CLIPPED * clipped) * width_px
     }
 }
 
@@ -418,6 +444,16 @@ impl<'a> Lines<'a> {
         for (out, value) in out.iter_mut().zip(from.iter().step_by(self.across)) {
             *out = light[usize::from(*value)];
         }
+    }
+
+    /// Mean value of so many samples from a place on, 0 to 255; 0 where they are not inside the image.
+    fn mean(&self, position: usize, first_px: f32, count: usize) -> f32 {
+        let first = first_px.max(0.0) as usize;
+        if first + count > self.length {
+            return 0.0;
+        }
+        let from = &self.plane.data[position * self.along + first * self.across..];
+        from.iter().step_by(self.across).take(count).map(|value| f32::from(*value)).sum::<f32>() / count as f32
     }
 
     /// The same between pixels; all NaN where it is not inside the image.

@@ -21,6 +21,7 @@ const SKIP: usize = 32;
 const PEAK_DISTANCE: usize = 6;
 /// Cells that tell the colour of the wall beside the line.
 const SIDE_CELLS: usize = 3;
+pub(super) const SIDE_PX: usize = SIDE_CELLS * CELL_PX;
 /// Candidates of one group, at most: the strongest.
 const MAX_CANDIDATES: usize = 8;
 
@@ -69,10 +70,9 @@ pub(super) struct Scratch {
 }
 
 impl Scratch {
-    /// How much poorer in the laser's colour than gray one side of a place is than the other, in chroma levels: red paint
-    /// swallows green light. 0 where neither side is poorer than gray, and where one is not in the image.
-    /// The sides begin `away_px` from the place.
-    pub(super) fn poorer_side(&self, group: usize, across_px: f32, away_px: f32) -> f32 {
+    /// How much of the laser's colour the wall has on both sides of a place, in chroma levels (below 0: poorer than gray).
+    /// The sides begin `away_px` from it and are [`SIDE_PX`] wide; `None` where one is not in the image.
+    pub(super) fn sides(&self, group: usize, across_px: f32, away_px: f32) -> Option<[f32; 2]> {
         let Field { values, groups, cells, samples } = &self.field;
         let side = |first_px: f32| {
             let first = (first_px / CELL_PX as f32).round();
@@ -80,11 +80,7 @@ impl Scratch {
             let side = inside.then(|| &values[group * cells + first as usize..][..SIDE_CELLS])?;
             Some(side.iter().map(|value| f32::from(*value)).sum::<f32>() / (SIDE_CELLS * samples) as f32)
         };
-        let width_px = (SIDE_CELLS * CELL_PX) as f32;
-        match (side(across_px - away_px - width_px), side(across_px + away_px)) {
-            (Some(left), Some(right)) => left.max(right).min(0.0) - left.min(right).min(0.0),
-            _ => 0.0,
-        }
+        Some([side(across_px - away_px - SIDE_PX as f32)?, side(across_px + away_px)?])
     }
 }
 
