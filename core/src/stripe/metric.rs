@@ -118,6 +118,8 @@ pub fn stripe_stages(laser: &Laser, options: &SpotOptions) -> (StripeFinder, Str
 pub struct Seen {
     /// The line, spot by spot, not smoothed; its σ is that of a spot on an even wall.
     pub stripe: Stripe,
+    /// How far what lies beside each spot may draw it aside, px: a part of its σ that its neighbours share.
+    drawn_px: Vec<f32>,
     /// Light along each line position around its spot, [`Seen::samples`] values each.
     light: Vec<f32>,
     /// First sample of each line position.
@@ -168,6 +170,7 @@ impl StripeFinder {
         let (positions, samples) = (luma.positions, shape.samples());
         let mut seen = Seen {
             stripe: Stripe::empty(self.laser.line, positions),
+            drawn_px: vec![0.0; positions],
             light: self.spare.try_recv().unwrap_or_default(),
             starts: vec![0; positions],
             shape,
@@ -197,17 +200,18 @@ impl StripeFinder {
             // The brightest place may be a glint beside the line: it is not where the colour is.
             let largest_px = OFF_COLOUR_PX.max(OFF_COLOUR_WIDTHS * width_px);
             let spot = spot.filter(|spot| (first as f32 + spot.at - start.expected_px).abs() <= largest_px);
-            let (at, sigma, height) = match spot {
+            let (at, sigma, drawn, height) = match spot {
                 // A weak spot is no spot. Light is compared as the eye and the encoder do: relative to where it stands.
                 Some(spot) if spot.height >= contrast_min * (0.15 + 2.0 * spot.background) => {
-                    (first as f32 + spot.at, spot.sigma, spot.height)
+                    (first as f32 + spot.at, spot.sigma, spot.drawn, spot.height)
                 }
                 Some(_) => continue,
-                None if start.coloured => (start.expected_px, COLOUR_SIGMA_PX, contrast_min),
+                None if start.coloured => (start.expected_px, COLOUR_SIGMA_PX, 0.0, contrast_min),
                 None => continue,
             };
             seen.stripe.across_px[position] = at;
-            seen.stripe.sigma_px[position] = sigma + self.beside_px(luma, light, position, at, width_px);
+            seen.drawn_px[position] = drawn + self.beside_px(luma, light, position, at, width_px);
+            seen.stripe.sigma_px[position] = sigma + seen.drawn_px[position];
             seen.stripe.confidence[position] = height.min(1.0);
         }
         seen
@@ -247,7 +251,7 @@ impl StripeMeasurer {
             self.divide_by_wall(seen, wall);
             self.lay_on(seen, &mut stripe);
         }
-        smoothing::smooth(&mut stripe, &self.options);
+        smoothing::smooth(&mut stripe, &seen.drawn_px, &self.options);
         stripe
     }
 

@@ -30,6 +30,8 @@ const TRUE_REACH: usize = 10;
 const BY_CHANCE: f32 = 1.0;
 /// As [`ALIKE`], for the difference of the two lines: what lies far apart cancels in it.
 const ALIKE_APART: f32 = 2.4;
+/// Standard deviation of what draws neighbouring spots aside together, as a share of how far it may.
+const DRAWN_SHARE: f32 = 0.3;
 /// A line that is less sure than this stays stiff.
 const UNSURE_PX: f32 = 0.4;
 /// A piece shorter than this that stands apart from the line on both sides is believed only where it is sure.
@@ -37,10 +39,12 @@ const ISLAND_ROWS: usize = 48;
 const ISLAND_SIGMA_PX: f32 = 0.3;
 
 /// Smooths the stripe and says how sure each position is; drops what is less sure than the recipe allows.
-pub(super) fn smooth(stripe: &mut Stripe, options: &SpotOptions) {
+///
+/// `drawn_px` says how far what lies beside each spot may draw it aside: no neighbours average that away that are as well.
+pub(super) fn smooth(stripe: &mut Stripe, drawn_px: &[f32], options: &SpotOptions) {
     let spots: Vec<Spot> = (0..stripe.across_px.len())
         .filter(|i| stripe.across_px[*i].is_finite())
-        .map(|i| Spot { position: i, at: stripe.across_px[i], sigma: stripe.sigma_px[i].max(0.01) })
+        .map(|i| Spot { position: i, at: stripe.across_px[i], sigma: stripe.sigma_px[i].max(0.01), drawn: drawn_px[i] })
         .collect();
     let bend = options.bend_px as f32;
     for piece in pieces(&spots) {
@@ -58,8 +62,8 @@ pub(super) fn smooth(stripe: &mut Stripe, options: &SpotOptions) {
             piece.iter().for_each(|spot| drop_spot(stripe, spot.position));
             continue;
         }
-        for (spot, (at, variance)) in piece.iter().zip(smooth) {
-            let sigma = sigma(variance);
+        for ((spot, (at, variance)), drawn) in piece.iter().zip(smooth).zip(shared(&piece)) {
+            let sigma = sigma(variance).hypot(DRAWN_SHARE * drawn);
             if sigma > options.sigma_max_px as f32 {
                 drop_spot(stripe, spot.position);
             } else {
@@ -87,6 +91,8 @@ struct Spot {
     position: usize,
     at: f32,
     sigma: f32,
+    /// How far what lies beside it may draw it aside, px.
+    drawn: f32,
 }
 
 /// Cuts the line at gaps and edges.
@@ -158,6 +164,22 @@ fn doubt(piece: &mut [Spot], smooth: &[(f32, f32)]) {
         let outlier = (scaled[i] / (OUTLIER_SIGMAS * scatter)).max(1.0);
         spot.sigma *= scatter * outlier * outlier;
     }
+}
+
+/// How far each spot and those about it may be drawn aside together, px: one that is sure says where the line is for those
+/// that are not.
+fn shared(piece: &[Spot]) -> Vec<f32> {
+    let mut sums = vec![(0.0, 0.0); piece.len() + 1];
+    for (i, spot) in piece.iter().enumerate() {
+        let weight = 1.0 / f64::from(spot.sigma * spot.sigma);
+        sums[i + 1] = (sums[i].0 + weight, sums[i].1 + weight * f64::from(spot.drawn));
+    }
+    (0..piece.len())
+        .map(|i| {
+            let (from, to) = (i.saturating_sub(TRUE_REACH), (i + TRUE_REACH + 1).min(piece.len()));
+            ((sums[to].1 - sums[from].1) / (sums[to].0 - sums[from].0)) as f32
+        })
+        .collect()
 }
 
 /// The stiff line, and the supple one where it differs by more than chance: a dent of some dozen rows would lose half of

@@ -34,8 +34,10 @@ const PATTERN_MIN_LIGHT: f32 = 0.004;
 pub(super) struct Spot {
     /// Samples from the profile's first.
     pub at: f32,
-    /// Standard deviation, px.
+    /// Standard deviation, px; without what draws it aside.
     pub sigma: f32,
+    /// How far light beside it may draw it aside, px.
+    pub drawn: f32,
     /// The line's light above the background at its highest.
     pub height: f32,
     /// The background's light.
@@ -80,7 +82,8 @@ impl SpotShape {
         let middle = (profile.len() / 2) as f32;
         ((at - middle).abs() < self.half as f32 - SIDE as f32).then(|| Spot {
             at,
-            sigma: self.sigma_px(light) + self.glare_px(left, right, height) + self.shoulder_px(profile, at, height),
+            sigma: self.sigma_px(light) + self.glare_px(left, right, height),
+            drawn: self.shoulder_px(profile, at, height),
             height,
             background: (left + right) / 2.0,
         })
