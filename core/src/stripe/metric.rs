@@ -51,7 +51,7 @@ const TINT_LEVELS: f32 = 40.0;
 const TINT_MOST: f32 = 1.5;
 /// Error of a spot's centre, widths of the line, where the wall beside it is as bright in the laser's colour as the sensor
 /// goes: from the first to the second light.
-const CLIPPED: f32 = 0.15;
+const CLIPPED: f32 = 0.1;
 const CLIPPED_LIGHT: (f32, f32) = (0.85, 0.95);
 /// The laser's own colour is the luma and so much of its chroma level (see [`evidence`]): of green, red and blue, about as
 /// in all standards.

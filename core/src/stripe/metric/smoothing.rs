@@ -31,7 +31,7 @@ const BY_CHANCE: f32 = 1.0;
 /// As [`ALIKE`], for the difference of the two lines: what lies far apart cancels in it.
 const ALIKE_APART: f32 = 2.4;
 /// Standard deviation of what draws neighbouring spots aside together, as a share of how far it may.
-const DRAWN_SHARE: f32 = 0.3;
+const DRAWN_SHARE: f32 = 0.2;
 /// A line that is less sure than this stays stiff.
 const UNSURE_PX: f32 = 0.4;
 /// A piece shorter than this that stands apart from the line on both sides is believed only where it is sure.
