@@ -62,6 +62,26 @@ MANY = (
     ("wall, 1920x1080", tuple(Scene(f"wall {s}", "wall", f"--seconds 5 --seed {s} --size 1920x1080") for s in range(401, 405))),
     ("pipe, gait, 1280x720", tuple(Scene(f"pipe {s}", "pipe", f"--seconds 6 --fps 60 --seed {s}") for s in range(501, 505))),
     ("pipe, gait, 640x360", tuple(Scene(f"pipe {s}", "pipe", f"--seconds 6 --fps 60 --seed {s} --size 640x360") for s in (601, 602))),
+    ("pipe, red laser; rail", (
+        Scene("pipe, red laser", "pipe", "--laser red --seconds 5 --fps 60 --seed 912"),
+        Scene("pipe, rail", "pipe-steady", "--seconds 5 --fps 60 --seed 911"),
+    )),
+    ("other walls and lasers", (
+        Scene("stops and goes back", "wall", "--motion stop --seconds 8 --seed 902"),
+        Scene("gait", "wall", "--motion gait --seconds 8 --seed 913"),
+        Scene("gait, 640x360", "wall", "--motion gait --size 640x360 --seconds 8 --seed 901"),
+        Scene("lens", "lens", "--seconds 6 --seed 903"),
+        Scene("red, lying", "wall", "--laser red --line horizontal --seconds 6 --seed 906"),
+        Scene("blue", "wall", "--laser blue --seconds 6 --seed 907"),
+        Scene("white", "white", "--seconds 5 --seed 908"),
+        Scene("black", "black", "--seconds 5 --seed 909"),
+        Scene("low light", "low-light", "--seconds 5 --seed 910"),
+    )),
+    ("lamps and paint", (
+        Scene("lamps and paint", "distractor", "--seconds 6 --seed 904"),
+        Scene("lamps and paint, another", "distractor", "--seconds 6 --seed 905"),
+        Scene("lamps and paint, 640x360", "distractor", "--seconds 6 --seed 914 --size 640x360"),
+    )),
 )
 """More runs of a kind, judged together: what a dozen features cannot tell."""
 QUICK = ("wall", "pipe, gait", "sound wall")
@@ -246,7 +266,7 @@ def changes(bench: Bench) -> Table:
 def main() -> int:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--quick", action="store_true", help="three scenes, no change between runs")
-    parser.add_argument("--many", action="store_true", help="22 more runs, judged together by kind and size, instead")
+    parser.add_argument("--many", action="store_true", help=f"{sum(len(scenes) for _, scenes in MANY)} more runs, judged together by kind and size, instead")
     parser.add_argument("--stria", type=Path, default=ROOT / "target/release/stria")
     parser.add_argument("--work", type=Path, default=ROOT / "target/bench/defects", help="where runs are kept for the next time")
     asked = parser.parse_args()

@@ -12,8 +12,9 @@ fn limit_radius_mm() -> f64 {
     LIMIT_RADIUS_MM
 }
 
-/// A region is longer than the travel between so many profiles: a single one that is wrong makes one as long as 1.
-pub(super) const LEAST_PROFILES: f64 = 1.35;
+/// A region is longer at half its height than the travel between so many profiles: a single one that is wrong makes one as
+/// long as 1, and half as much again once it is smoothed.
+pub(super) const LEAST_PROFILES: f64 = 1.8;
 
 /// Radius of the least dent that is longer than that at half of its depth, mm.
 pub(super) fn least_radius_mm(profile_step_mm: f64) -> f64 {
