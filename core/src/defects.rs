@@ -21,6 +21,7 @@
 mod background;
 mod cells;
 pub mod change;
+mod doubt;
 mod form;
 mod gathered;
 mod joint;
@@ -38,6 +39,7 @@ use crate::depth_map::MapReader;
 use crate::error::Result;
 use crate::recipe::DefectOptions;
 use cells::{CellGrid, Field};
+use doubt::Doubt;
 use gathered::Gathered;
 use reference::{Place, choose};
 use stretch::{COARSE, Task, examine};
@@ -133,8 +135,9 @@ pub fn find(
     let mut gathered = Gathered::default();
     for (core, columns) in grid.stretches() {
         let depth = grid.read(map, columns.start, columns.len())?;
+        let doubt = grid.read_doubt(map, columns.start, columns.len())?;
         let task = Task { grid: &grid, options, shape, wave_mm, sampling, columns, core: core.clone() };
-        let examined = examine(&task, &depth);
+        let examined = examine(&task, &depth, &Doubt::of(&doubt));
         let nothing = Field::new(core.len(), grid.rows, f32::NAN);
         take(&ResidualStrip {
             origin_mm: (grid.x0_mm, grid.y0_mm),

@@ -7,10 +7,10 @@ mod grid;
 mod reader;
 pub mod sheet;
 pub mod strips;
+mod window;
 
 use std::collections::{HashMap, HashSet};
 use std::fs::File;
-use std::ops::Range;
 use std::os::unix::fs::FileExt;
 use std::path::Path;
 
@@ -27,10 +27,9 @@ pub const TILE_SIDE_PX: usize = 256;
 const TILE_PX: usize = TILE_SIDE_PX * TILE_SIDE_PX;
 /// Tiles of a finished map that are held in memory, where it does not fit there as a whole: readers go through it once.
 const READ_TILES: usize = 8;
-/// A window of so many columns of a tile, or more, is read past the tiles in memory.
-const READ_PAST_PX: i64 = TILE_SIDE_PX as i64 / 2;
 /// A tile on disk: depth and its weight as float32, then red, green, blue and a flag a pixel.
-const TILE_BYTES: usize = TILE_PX * 12;
+const LAYER_BYTES: usize = TILE_PX * 4;
+const TILE_BYTES: usize = LAYER_BYTES * 3;
 
 /// Where a map lies: pixel (0, 0)'s centre is at (x0, y0) in the world; columns run along +x, rows along +y.
 #[derive(Clone, Copy, Debug, PartialEq, Serialize, Deserialize)]
@@ -264,13 +263,6 @@ impl SurfaceMap {
         self.changed.drain().collect()
     }
 
-    /// A whole tile of the grid.
-    pub fn tile_window(&mut self, index: TileIndex) -> Result<MapWindow> {
-        let mut window = MapWindow::empty(TILE_SIDE_PX, TILE_SIDE_PX);
-        copy_part(self.tile(index)?.rows(), (0, 0), &mut window);
-        Ok(window)
-    }
-
     /// The rectangle of the measured pixels; `None` where nothing was measured.
     fn geometry(&self) -> Option<MapGeometry> {
         let (columns, rows) = self.bounds?;
@@ -281,30 +273,6 @@ impl SurfaceMap {
             width_px: (columns[1] - columns[0] + 1) as usize,
             height_px: (rows[1] - rows[0] + 1) as usize,
         })
-    }
-
-    /// Reads a rectangle of [`SurfaceMap::geometry`]; what lies outside the measured tiles is empty.
-    fn window(&mut self, column_px: usize, row_px: usize, width_px: usize, height_px: usize) -> Result<MapWindow> {
-        let mut window = MapWindow::empty(width_px, height_px);
-        let Some((columns, rows)) = self.bounds else { return Ok(window) };
-        let (left, top) = (columns[0] + column_px as i64, rows[0] + row_px as i64);
-        let side = TILE_SIDE_PX as i64;
-        for tile_row in top.div_euclid(side)..=(top + height_px as i64 - 1).div_euclid(side) {
-            for tile_column in left.div_euclid(side)..=(left + width_px as i64 - 1).div_euclid(side) {
-                let (index, offset) = ((tile_column, tile_row), (tile_column * side - left, tile_row * side - top));
-                let columns = (offset.0 + side).min(width_px as i64) - offset.0.max(0);
-                match self.slots.get(&index) {
-                    Some(slot) if columns >= READ_PAST_PX && !self.places.contains_key(&index) => {
-                        let rows = (-offset.1).max(0) as usize..side.min(height_px as i64 - offset.1) as usize;
-                        let rows = self.read_rows(*slot, rows)?;
-                        copy_part(rows.view(), offset, &mut window);
-                    }
-                    None if !self.places.contains_key(&index) => {}
-                    _ => copy_part(self.tile(index)?.rows(), offset, &mut window),
-                }
-            }
-        }
-        Ok(window)
     }
 
     /// The tile, from memory, from the scratch file, or new.
@@ -368,27 +336,13 @@ impl SurfaceMap {
         Ok(())
     }
 
-    /// Some rows of a tile in the scratch file, without what they weigh.
-    fn read_rows(&self, slot: u64, rows: Range<usize>) -> Result<TileRows> {
-        let (start, first) = (slot * TILE_BYTES as u64, (rows.start * TILE_SIDE_PX * 4) as u64);
-        let mut bytes = vec![0; rows.len() * TILE_SIDE_PX * 4];
-        let mut read = |at: u64| {
-            let done = self.scratch.read_exact_at(&mut bytes, at);
-            done.map_err(|e| Error::io(&self.scratch_path, e))?;
-            Ok::<_, Error>(bytes.chunks_exact(4).map(|b| [b[0], b[1], b[2], b[3]]).collect::<Vec<[u8; 4]>>())
-        };
-        let depth_mm = read(start + first)?.into_iter().map(f32::from_le_bytes).collect();
-        let texture = read(start + 2 * TILE_PX as u64 * 4 + first)?;
-        Ok(TileRows { first: rows.start, depth_mm, texture })
-    }
-
     fn read_tile(&self, slot: u64) -> Result<Tile> {
         let mut bytes = vec![0; TILE_BYTES];
         self.scratch
             .read_exact_at(&mut bytes, slot * TILE_BYTES as u64)
             .map_err(|e| Error::io(&self.scratch_path, e))?;
-        let (depth, rest) = bytes.split_at(TILE_PX * 4);
-        let (weight, texture) = rest.split_at(TILE_PX * 4);
+        let (depth, rest) = bytes.split_at(LAYER_BYTES);
+        let (weight, texture) = rest.split_at(LAYER_BYTES);
         let floats =
             |bytes: &[u8]| bytes.chunks_exact(4).map(|b| f32::from_le_bytes([b[0], b[1], b[2], b[3]])).collect();
         Ok(Tile {
@@ -403,31 +357,7 @@ impl SurfaceMap {
     }
 }
 
-/// Some rows of a tile.
-struct TileRows {
-    first: usize,
-    depth_mm: Vec<f32>,
-    texture: Vec<[u8; 4]>,
-}
-
-/// The same, lent.
-struct TileView<'a> {
-    first_row: usize,
-    depth_mm: &'a [f32],
-    texture: &'a [[u8; 4]],
-}
-
-impl TileRows {
-    fn view(&self) -> TileView<'_> {
-        TileView { first_row: self.first, depth_mm: &self.depth_mm, texture: &self.texture }
-    }
-}
-
 impl Tile {
-    fn rows(&self) -> TileView<'_> {
-        TileView { first_row: 0, depth_mm: &self.depth_mm, texture: &self.texture }
-    }
-
     fn empty(index: TileIndex) -> Tile {
         Tile {
             index,
@@ -454,22 +384,6 @@ fn place(column: i64, row: i64) -> (TileIndex, usize) {
     ((column.div_euclid(side), row.div_euclid(side)), at as usize)
 }
 
-/// Copies the part of a tile that lies in the window; `offset` is the tile's corner in the window.
-fn copy_part(tile: TileView<'_>, offset: (i64, i64), window: &mut MapWindow) {
-    let side = TILE_SIDE_PX as i64;
-    let columns = offset.0.max(0)..(offset.0 + side).min(window.width_px as i64);
-    let count = (columns.end - columns.start).max(0) as usize;
-    for row in offset.1.max(0)..(offset.1 + side).min(window.height_px as i64) {
-        let from = ((row - offset.1 - tile.first_row as i64) * side + columns.start - offset.0) as usize;
-        let to = row as usize * window.width_px + columns.start as usize;
-        window.depth_mm[to..to + count].copy_from_slice(&tile.depth_mm[from..from + count]);
-        let colours = &tile.texture[from..from + count];
-        for (colour, [red, green, blue, there]) in window.texture[to..to + count].iter_mut().zip(colours) {
-            *colour = (*there != 0).then_some([*red, *green, *blue]);
-        }
-    }
-}
-
 #[cfg(test)]
 mod tests {
     use super::*;
@@ -482,9 +396,11 @@ mod tests {
     #[test]
     fn values_come_back_from_memory_and_from_the_scratch_file() {
         let mut map = map(4);
+        let weight_of = |column: i64| 0.5 + (column & 3) as f32;
         for column in -700..3000_i64 {
             for row in [-3_i64, 0, 300] {
-                map.put_depth(column, row, (column * 1000 + row) as f32).expect("put");
+                let depth_mm = (column * 1000 + row) as f32;
+                map.blend_run(column, row, &[Cell { depth_mm, weight: weight_of(column), rgb: None }]).expect("put");
             }
             map.put_texture(column, 0, [(column & 255) as u8, 2, 3], false).expect("put");
         }
@@ -498,6 +414,11 @@ mod tests {
             assert!(window.depth_mm[at(1)].is_nan());
             assert_eq!(window.texture[at(0)], Some([(column & 255) as u8, 2, 3]));
             assert_eq!(window.texture[at(-3)], None);
+        }
+        let weights = map.weights(0, 0, 3700, 304).expect("weights");
+        for (at, weight) in weights.iter().enumerate() {
+            let (column, row) = ((at % 3700) as i64 - 700, at / 3700);
+            assert_eq!(*weight, if [0, 3, 303].contains(&row) { weight_of(column) } else { 0.0 }, "{column}, {row}");
         }
         assert_eq!(map.measured, 3 * 3700);
         assert!(map.tiles.len() <= 4);
@@ -513,11 +434,11 @@ mod tests {
             [(0, 0, 3700, 304), (100, 1, 3000, 64), (5, 250, 300, 54), (1020, 0, 7, 304)]
         {
             let piece = finished.window(column, row, width, height).expect("window");
+            let weighs = finished.weights(column, row, width, height).expect("weights");
             for line in 0..height {
-                assert!(
-                    same(&piece, line * width, &window, (row + line) * 3700 + column, width),
-                    "{column} {row} {line}"
-                );
+                let from = (row + line) * 3700 + column;
+                assert_eq!(weighs[line * width..(line + 1) * width], weights[from..from + width]);
+                assert!(same(&piece, line * width, &window, from, width), "{column} {row} {line}");
             }
         }
     }

@@ -88,20 +88,39 @@ impl CellGrid {
         self.y0_mm + row * self.cell_mm
     }
 
-    /// Reads `columns` columns of cells from `first` on; both within the grid.
+    /// Reads `columns` columns of cells from `first` on, both within the grid: depth, mm.
     pub(super) fn read(&self, map: &mut dyn MapReader, first: usize, columns: usize) -> Result<Field> {
+        self.means(first, columns, |[left, top, width, height]| Ok(map.window(left, top, width, height)?.depth_mm))
+    }
+
+    /// How doubtful the depths of [`CellGrid::read`] are: of pixels that weigh w, the mean of 1 ∕ w − 1, at least 0.
+    pub(super) fn read_doubt(&self, map: &mut dyn MapReader, first: usize, columns: usize) -> Result<Field> {
+        self.means(first, columns, |[left, top, width, height]| {
+            let mut doubts = map.weights(left, top, width, height)?;
+            doubts.iter_mut().for_each(|weight| *weight = (1.0 / *weight - 1.0).max(0.0));
+            Ok(doubts)
+        })
+    }
+
+    /// The mean of the finite values of each cell's pixels, NaN where they are too few; `read` gives a rectangle of the map.
+    fn means(
+        &self,
+        first: usize,
+        columns: usize,
+        mut read: impl FnMut([usize; 4]) -> Result<Vec<f32>>,
+    ) -> Result<Field> {
         let k = self.factor;
         let mut sums = Field::new(columns, self.rows, 0.0);
         let mut counts = written(0_u16, columns * self.rows);
         // Whole cells at once.
         let at_once = [READ_PX, READ_ROWS_PX].map(|px| (px / k).max(1) * k);
         for [left, top, width, height] in rectangles([columns * k, self.rows * k], at_once) {
-            let window = map.window(first * k + left, top, width, height)?;
-            for (row, line) in (top..).zip(window.depth_mm.chunks_exact(width)) {
+            let values = read([first * k + left, top, width, height])?;
+            for (row, line) in (top..).zip(values.chunks_exact(width)) {
                 let start = row / k * columns + left / k;
                 for (column, pixels) in line.chunks_exact(k).enumerate() {
-                    for z_mm in pixels.iter().filter(|z| z.is_finite()) {
-                        sums.values[start + column] += z_mm;
+                    for value in pixels.iter().filter(|value| value.is_finite()) {
+                        sums.values[start + column] += value;
                         counts[start + column] += 1;
                     }
                 }

@@ -211,7 +211,7 @@ pub fn compare(
 struct Difference {
     columns: std::ops::Range<usize>,
     search: Search,
-    near_gap: Vec<bool>,
+    frail: Vec<bool>,
     wave_mm: f64,
     /// The sparser of both runs'.
     sampling: Sampling,
@@ -270,10 +270,10 @@ impl Difference {
     ) -> Difference {
         let mut raw = later.clone();
         raw.values.iter_mut().zip(&earlier.values).for_each(|(l, e)| *l -= e);
-        let (gap, doubt) = stretch::gap_cells(&sampling, grid.cell_mm);
+        let (gap, doubted) = stretch::gap_cells(&sampling, grid.cell_mm);
         let untouched = stretch::near_gaps(&raw, gap);
         raw.values.iter_mut().zip(untouched).filter(|(_, near)| *near).for_each(|(v, _)| *v = f32::NAN);
-        let near_gap = stretch::near_gaps(&raw, doubt);
+        let frail = stretch::near_gaps(&raw, doubted);
         let coarse = raw.shrunk(COARSE, stretch::COARSE_SHARE);
         let wave_mm = list.reference.wave_mm;
         let wave_cells = wave_mm / (grid.cell_mm * COARSE as f64);
@@ -287,7 +287,7 @@ impl Difference {
             background = plate(&coarse, &weights, stiffness(wave_cells));
             search = Search::against(&raw, &background, &slopes, sd_mm, options, Some(&masked));
         }
-        Difference { columns, search, near_gap, wave_mm, sampling }
+        Difference { columns, search, frail, wave_mm, sampling }
     }
 
     fn core(&self, core: &std::ops::Range<usize>) -> Vec<f32> {
@@ -319,7 +319,7 @@ impl Difference {
             reference: &reference,
             deviation: &self.search.off,
             smooth: &self.search.smooth,
-            near_gap: &self.near_gap,
+            frail: &self.frail,
             thresholds_mm: &self.search.thresholds_mm,
             noise_mm: &self.search.noise.rows_mm,
             taken: &taken,

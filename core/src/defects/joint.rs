@@ -254,16 +254,10 @@ fn within_others(
     }
     let mut taken = vec![false; smooth.values.len()];
     regions.iter().flat_map(|region| &region.cells).for_each(|cell| taken[*cell] = true);
-    let near_gap = near_gaps(rest, APART_CELLS);
-    let near_gap: Vec<bool> = near_gap.iter().zip(stretch.near_gap).map(|(own, gap)| *own || *gap).collect();
-    let left = Stretch {
-        deviation: rest,
-        smooth: &smooth,
-        near_gap: &near_gap,
-        slack: Some(&slack),
-        taken: &taken,
-        ..*stretch
-    };
+    let frail: Vec<bool> =
+        near_gaps(rest, APART_CELLS).iter().zip(stretch.frail).map(|(own, before)| *own || *before).collect();
+    let left =
+        Stretch { deviation: rest, smooth: &smooth, frail: &frail, slack: Some(&slack), taken: &taken, ..*stretch };
     let found = regions.into_iter().filter_map(|region| {
         let defect = measure(&left, &region, options)?;
         let form = start(stretch, &defect)?;

@@ -57,8 +57,8 @@ pub(super) struct Stretch<'a> {
     pub deviation: &'a Field,
     /// Smoothed, and continued over narrow gaps.
     pub smooth: &'a Field,
-    /// Cells beside which nothing was measured.
-    pub near_gap: &'a [bool],
+    /// Cells on which alone no defect is believed: beside what was not measured, or doubtful.
+    pub frail: &'a [bool],
     /// Threshold of each row, mm.
     pub thresholds_mm: &'a [f32],
     /// Scatter of each row, mm.
@@ -224,7 +224,7 @@ fn believed(relief: &Relief, options: &DefectOptions) -> bool {
     let stretch = relief.stretch;
     let rough = relief.height(relief.region.summit);
     let upper: Vec<usize> = relief.above(0.5 * rough).collect();
-    let firm = |cell: &&usize| stretch.deviation.values[**cell].is_finite() && !stretch.near_gap[**cell];
+    let firm = |cell: &&usize| stretch.deviation.values[**cell].is_finite() && !stretch.frail[**cell];
     let firm: Vec<usize> = upper.iter().filter(firm).copied().collect();
     let threshold = stretch.threshold_mm(relief.region.summit);
     let alone = firm.iter().filter(|c| relief.height(**c) > threshold).count() as f64;

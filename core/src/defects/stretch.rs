@@ -5,6 +5,7 @@
 
 use super::background::{plate, refined, robust_plate, stiffness};
 use super::cells::{CellGrid, Field};
+use super::doubt::Doubt;
 use super::form::Blur;
 use super::joint::{Measured, measure_together};
 use super::measure::{Stretch, least_cells};
@@ -89,17 +90,19 @@ pub(super) struct Examined {
 }
 
 /// Examines a stretch; `depth` is its world z in cells. `None` where too little was measured.
-pub(super) fn examine(task: &Task, depth: &Field) -> Option<Examined> {
+pub(super) fn examine(task: &Task, depth: &Field, doubt: &Doubt) -> Option<Examined> {
     let (grid, options) = (task.grid, task.options);
     let reference = fit(task.shape, &places(task, depth))?;
     let mut deviation = deviation(task, &reference, depth);
-    let (gap, doubt) = gap_cells(&task.sampling, grid.cell_mm);
+    let (gap, doubted) = gap_cells(&task.sampling, grid.cell_mm);
     let untouched = near_gaps(&deviation, gap);
     deviation.values.iter_mut().zip(untouched).filter(|(_, near)| *near).for_each(|(v, _)| *v = f32::NAN);
+    let mut frail = near_gaps(&deviation, gap + doubted);
+    // What was left out for doubt is no gap: its neighbours have doubts of their own, or none.
+    doubt.leave_out(&mut deviation, &mut frail);
     let coarse = deviation.shrunk(COARSE, COARSE_SHARE);
     let wave_cells = task.wave_mm / (grid.cell_mm * COARSE as f64);
     let mut background = robust_plate(&coarse, stiffness(FIRST_LENGTH * wave_cells), LEAST_SCATTER_MM);
-    let gaps = near_gaps(&deviation, gap + doubt);
     let mut search = Search::of(task, &deviation, &background, None);
     let first = Threshold::of(&search.thresholds_mm);
     for _ in 0..ROUNDS {
@@ -120,7 +123,7 @@ pub(super) fn examine(task: &Task, depth: &Field) -> Option<Examined> {
         reference: &reference,
         deviation: &off,
         smooth: &smooth,
-        near_gap: &gaps,
+        frail: &frail,
         thresholds_mm: &thresholds_mm,
         noise_mm: &noise.rows_mm,
         taken: &taken,

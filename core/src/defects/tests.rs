@@ -1,7 +1,7 @@
 //! The search on maps that are known: what is on them, and nothing else.
 
 use super::*;
-use crate::depth_map::{GridMap, MapGeometry};
+use crate::depth_map::{GridMap, MapGeometry, MapWindow};
 use crate::recipe::Recipe;
 
 /// A raised cosine: (x, y, radius, height), mm.
@@ -32,7 +32,7 @@ fn map(width_px: usize, base: impl Fn(f64, f64) -> f64, bumps: &[Bump], hole: im
 /// The maps of these tests are not blurred.
 const SAMPLING: Sampling = Sampling { profile_step_mm: 0.1, line_step_mm: 0.0, line_width_mm: 0.0 };
 
-fn found(map: &mut GridMap) -> Findings {
+fn found(map: &mut dyn MapReader) -> Findings {
     let recipe = Recipe::default();
     find(map, &recipe.defects, Chainage { start_mm: 1000.0, falls: false }, SAMPLING, &mut |_| Ok(()))
         .expect("find")
@@ -124,4 +124,64 @@ fn a_dent_in_another_s_footprint_is_told_apart_and_neither_spoils_the_other() {
         assert!((defect.area_mm2 / area_mm2 - 1.0).abs() < 0.15, "{area_mm2} mm²: {defect:#?}");
         assert!((defect.depth_mm - height).abs() < 3.0 * defect.depth_sd_mm, "{height} mm: {defect:#?}");
     }
+}
+
+/// A map whose depths are not equally sure; what one weighs is told by its place.
+struct Weighed<'a> {
+    map: GridMap,
+    weight: &'a dyn Fn(f64, f64) -> f32,
+}
+
+impl MapReader for Weighed<'_> {
+    fn geometry(&self) -> MapGeometry {
+        self.map.geometry()
+    }
+
+    fn window(&mut self, column_px: usize, row_px: usize, width_px: usize, height_px: usize) -> Result<MapWindow> {
+        self.map.window(column_px, row_px, width_px, height_px)
+    }
+
+    fn weights(&mut self, column_px: usize, row_px: usize, width_px: usize, height_px: usize) -> Result<Vec<f32>> {
+        let MapGeometry { x0_mm, y0_mm, .. } = self.geometry();
+        let weight = |at: usize| {
+            let (column, row) = (column_px + at % width_px, row_px + at / width_px);
+            (self.weight)(x0_mm + column as f64, y0_mm + row as f64)
+        };
+        Ok((0..width_px * height_px).map(weight).collect())
+    }
+}
+
+/// Where a wall with a dent at x = 300 mm and another at x = 700 mm has defects.
+fn where_found(weight: &dyn Fn(f64, f64) -> f32) -> Vec<f64> {
+    let map = map(1200, wall, &[(300.0, 0.0, 30.0, 4.0), (700.0, 0.0, 30.0, 4.0)], |_, _| false);
+    found(&mut Weighed { map, weight }).list.defects.iter().map(|d| 100.0 * (d.x_mm / 100.0).round()).collect()
+}
+
+#[test]
+fn what_stands_out_where_the_map_is_doubtful_is_no_defect() {
+    let second = |weight: f32| move |x: f64, y: f64| if (x - 700.0).hypot(y) < 35.0 { weight } else { 0.95 };
+    assert_eq!(where_found(&second(0.95)), [300.0, 700.0]);
+    // Too doubtful to be looked at, and too doubtful to be believed.
+    assert_eq!(where_found(&second(0.1)), [300.0]);
+    assert_eq!(where_found(&second(0.45)), [300.0]);
+    // Less sure than the rest, and sure enough.
+    assert_eq!(where_found(&second(0.6)), [300.0, 700.0]);
+}
+
+#[test]
+fn a_map_that_is_doubtful_everywhere_is_searched_all_the_same() {
+    assert_eq!(where_found(&|_, _| 0.2), [300.0, 700.0]);
+}
+
+#[test]
+fn a_doubtful_spike_in_a_dent_does_not_spoil_its_figures() {
+    let bumps = [(600.0, 0.0, 40.0, 6.0), (610.0, 10.0, 8.0, -12.0)];
+    let weight = |x: f64, y: f64| if (x - 610.0).hypot(y - 10.0) < 8.0 { 0.1 } else { 0.95 };
+    let map = map(1200, wall, &bumps, |_, _| false);
+    let believed = found(&mut map.clone());
+    let doubted = found(&mut Weighed { map, weight: &weight });
+    let [dent] = &doubted.list.defects[..] else { unreachable!("{:#?}", doubted.list.defects) };
+    assert!((dent.depth_mm - 6.0).abs() < 0.4 && (dent.x_mm - 600.0).hypot(dent.y_mm) < 2.0, "{dent:#?}");
+    let as_good = |d: &Defect| (d.depth_mm - 6.0).abs() < 0.4 && (d.x_mm - 600.0).hypot(d.y_mm) < 2.0;
+    assert!(believed.list.defects.len() != 1 || !as_good(&believed.list.defects[0]), "the spike is none");
 }

@@ -33,6 +33,13 @@ pub trait MapReader {
 
     /// Reads a rectangle of the map; what lies outside is empty.
     fn window(&mut self, column_px: usize, row_px: usize, width_px: usize, height_px: usize) -> Result<MapWindow>;
+
+    /// What the depths of a rectangle weigh, row by row: the sum of the confidences of the profiles that reached a pixel,
+    /// 0 where nothing was measured. `height_px * width_px` values. A map that does not know takes each depth for sure: 1.
+    fn weights(&mut self, column_px: usize, row_px: usize, width_px: usize, height_px: usize) -> Result<Vec<f32>> {
+        let window = self.window(column_px, row_px, width_px, height_px)?;
+        Ok(window.depth_mm.iter().map(|z| f32::from(u8::from(z.is_finite()))).collect())
+    }
 }
 
 /// A map in which something was measured, for reading.
@@ -55,6 +62,10 @@ impl MapReader for FinishedMap<'_> {
 
     fn window(&mut self, column_px: usize, row_px: usize, width_px: usize, height_px: usize) -> Result<MapWindow> {
         self.map.window(column_px, row_px, width_px, height_px)
+    }
+
+    fn weights(&mut self, column_px: usize, row_px: usize, width_px: usize, height_px: usize) -> Result<Vec<f32>> {
+        self.map.weights(column_px, row_px, width_px, height_px)
     }
 }
 
@@ -93,6 +104,10 @@ impl MapReader for SharedReader<'_, '_, '_> {
 
     fn window(&mut self, column_px: usize, row_px: usize, width_px: usize, height_px: usize) -> Result<MapWindow> {
         self.shared.lock().window(column_px, row_px, width_px, height_px)
+    }
+
+    fn weights(&mut self, column_px: usize, row_px: usize, width_px: usize, height_px: usize) -> Result<Vec<f32>> {
+        self.shared.lock().weights(column_px, row_px, width_px, height_px)
     }
 }
 

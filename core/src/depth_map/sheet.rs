@@ -14,6 +14,8 @@ const MAX_ROW_GAP: u32 = 4;
 /// millimetre, are no neighbours on the surface: an edge hides what is between them.
 const STEEPEST: f64 = 8.0;
 const EDGE_MM: f64 = 1.0;
+/// A point weighs at least this.
+const LEAST_WEIGHT: f64 = 1e-3;
 /// Frames that a row may be without a spot and still be joined to the one before.
 const MAX_FRAME_GAP: u32 = 3;
 
@@ -48,7 +50,8 @@ pub struct Sheet {
 struct Sample {
     x_mm: f64,
     z_mm: f64,
-    weight: f64,
+    /// 1 over the weight. Weights fall with a position's variance, and of a straight line it is the variances that mix.
+    doubt: f64,
     line_position: u32,
     frame: u32,
     part: u32,
@@ -86,7 +89,7 @@ impl Sheet {
                 let sample = Sample {
                     x_mm: between(a.x, b.x),
                     z_mm: between(a.z, b.z),
-                    weight: between(f64::from(pair[0].confidence), f64::from(pair[1].confidence)).max(1e-3),
+                    doubt: between(doubt(&pair[0]), doubt(&pair[1])),
                     line_position: position[usize::from(share > 0.5)],
                     frame: pair[0].frame,
                     part,
@@ -116,7 +119,7 @@ impl Sheet {
             // The first of a row: the nearest cell alone.
             let cell = Cell {
                 depth_mm: sample.z_mm as f32,
-                weight: sample.weight as f32,
+                weight: sample.doubt.recip() as f32,
                 rgb: colours.and_then(|c| c.at(sample.line_position, 1.0)),
             };
             return map.blend_run(nearest, row, &[cell]);
@@ -134,10 +137,10 @@ impl Sheet {
         self.cells.clear();
         for at in low..=high {
             let share = (at as f64 - from) / (to - from);
-            let weight = last.weight + share * (sample.weight - last.weight);
+            let doubt = last.doubt + share * (sample.doubt - last.doubt);
             self.cells.push(Cell {
                 depth_mm: (last.z_mm + share * (sample.z_mm - last.z_mm)) as f32,
-                weight: weight as f32,
+                weight: doubt.recip() as f32,
                 rgb: colours.and_then(|c| c.at(sample.line_position, share)),
             });
         }
@@ -160,6 +163,10 @@ impl Sheet {
         }
         &mut self.rows[at]
     }
+}
+
+fn doubt(point: &SurfacePoint) -> f64 {
+    f64::from(point.confidence).max(LEAST_WEIGHT).recip()
 }
 
 #[cfg(test)]
@@ -199,6 +206,24 @@ mod tests {
                 // World y and z are float in the points: the rows are cut to a hundredth of a millimetre.
                 assert!((found - expected).abs() < 2e-2, "{column}, {row}: {found} mm, not {expected}");
             }
+        }
+    }
+
+    #[test]
+    fn between_a_sure_profile_and_a_doubtful_one_it_is_the_variances_that_mix() {
+        let grid = Grid { x_mm: 0.0, y_mm: 0.0, mm_per_px: 1.0 };
+        let mut map = SurfaceMap::create(grid, 8, &std::env::temp_dir()).expect("map");
+        let mut sheet = Sheet::new(grid, 10.0);
+        for (frame, x_mm, confidence) in [(0, 0.0, 0.8), (1, 4.0, 0.1)] {
+            let (mut points, positions) = profile(x_mm, frame, 0..100);
+            points.iter_mut().for_each(|point| point.confidence = confidence);
+            sheet.add(&mut map, &points, &positions, 0, None).expect("add");
+        }
+        let weights = map.weights(0, 7, 5, 1).expect("weights");
+        for (column, weight) in weights.iter().enumerate() {
+            // 1 over the weight goes straight from 1.25 to 10.
+            let expected = 1.0 / (1.25 + (10.0 - 1.25) * column as f32 / 4.0);
+            assert!((weight / expected - 1.0).abs() < 1e-5, "{column}: {weights:?}");
         }
     }
 
