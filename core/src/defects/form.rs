@@ -12,7 +12,7 @@ use nalgebra::{SMatrix, SVector};
 use super::cells::Field;
 
 /// How far beyond its rim a form is fitted, in half axes: the ground about it.
-const REACH: f64 = 1.5;
+const REACH: f64 = 1.3;
 /// About so many cells are used; neighbours say nearly the same.
 const SAMPLES: f64 = 500.0;
 const LEAST_SAMPLES: usize = 24;
@@ -23,8 +23,10 @@ const ENOUGH: f64 = 2e-3;
 const HUBER: f64 = 3.0;
 /// Least scatter that is believed, mm.
 const LEAST_SCATTER_MM: f64 = 1e-3;
-/// An ellipse is believed where it leaves less than this share of the circle's squares.
+/// An ellipse is believed where it leaves less than this share of the circle's squares, and so much of it was measured: of
+/// what is seen in part, beside a highlight, the other half axis is a guess.
 const ELLIPSE_GAIN: f64 = 0.8;
+const ELLIPSE_MEASURED: f64 = 0.9;
 /// A Gaussian's three nodes (in standard deviations) with their weights.
 const NODES: [(f64, f64); 3] =
     [(-1.732_050_807_568_877_2, 1.0 / 6.0), (0.0, 2.0 / 3.0), (1.732_050_807_568_877_2, 1.0 / 6.0)];
@@ -209,7 +211,7 @@ impl Form {
         let samples = self.samples(rest, blur);
         let is_round = self.along == self.across && self.lean == 0.0;
         let first = Adjustment { samples: &samples, blur, round: is_round }.settled(*self)?;
-        let best = match askew && is_round {
+        let best = match askew && is_round && first.form.measured_share(rest) > ELLIPSE_MEASURED {
             true => {
                 let askew = Adjustment { samples: &samples, blur, round: false }.settled(first.form);
                 askew.filter(|askew| askew.squares < ELLIPSE_GAIN * first.squares).unwrap_or(first)
@@ -430,6 +432,22 @@ mod tests {
         assert!((found.height_mm + 4.0).abs() < 0.15 && (found.lean - 0.5).abs() < 0.05, "{found:?}");
         assert!((found.area_cells() / bulge.area_cells() - 1.0).abs() < 0.06, "{found:?}");
         assert!((found.extents().1 / bulge.extents().1 - 1.0).abs() < 0.05, "{found:?}");
+    }
+
+    #[test]
+    fn of_what_is_seen_in_part_no_second_half_axis_is_guessed() {
+        let bulge = Form { along: 22.0, across: 11.0, ..Form::round(70.0, 55.0, 1.0, -4.0) };
+        let blur = (1.0, 1.0);
+        let start = Form::round(70.0, 55.0, 15.0, -4.0);
+        let mut rest = field_with(&[bulge], blur);
+        start.add_to(&mut rest, -1.0, blur);
+        let is_round = |rest: &Field| {
+            let form = start.fitted(rest, blur, true).expect("a fit").form;
+            form.along == form.across
+        };
+        assert!(!is_round(&rest), "seen whole it is an ellipse");
+        rest.values[58 * 140..63 * 140].fill(f32::NAN);
+        assert!(is_round(&rest));
     }
 
     #[test]

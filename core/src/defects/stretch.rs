@@ -36,11 +36,12 @@ const DOUBT_ROWS: f64 = 6.0;
 pub(super) const SMOOTH_SHARE: f32 = 0.3;
 /// A spot's place is told by the line's two flanks, as far as this share of its width from the middle, and by samples a
 /// pixel apart: a surface that bends shows the mean of them. Measured against the true second derivatives of 200
-/// simulated dents at five distances and image sizes, as the two below.
+/// simulated dents at five distances and image sizes, as the share of a profile's distance below.
 const FLANK_WIDTHS: f64 = 0.35;
 const FLANK_PIXELS: f64 = 1.45;
-/// Standard deviation of the smoothing along the line where it bends, in rows.
-const LINE_SMOOTHING_ROWS: f64 = 1.75;
+/// Standard deviation of the smoothing along the line where it bends, in rows: with it the depths of 250 simulated dents of 20
+/// to 45 mm radius are right in the mean to half a percent; at 640 × 360 those of less than 28 mm to 2 %.
+const LINE_SMOOTHING_ROWS: f64 = 2.1;
 /// Between two profiles the surface is nearly straight: this share of the square of their distance.
 const STRAIGHT_SHARE: f64 = 1.0 / 7.0;
 /// Least scatter of coarse cells that is believed, mm.
