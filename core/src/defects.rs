@@ -4,7 +4,8 @@
 //! run's length. In each stretch a plane or a cylinder along the travel is fitted (chosen by evidence
 //! for the whole run), then a background that follows slow waves and the poses' drift but leaves the defects out; what
 //! is left is the *residual*. Its regions that rise above `max(defects.depth_min_mm, defects.noise_factor · σ)` are
-//! defects; σ is the residual's own scatter beside them, row by row.
+//! defects; σ is the residual's own scatter beside them, row by row. Cells whose weights say that the stripe was unsure there
+//! are left out of it, and those that are less so do not make a defect alone.
 //!
 //! # Figures
 //!

@@ -77,10 +77,12 @@ MANY = (
         Scene("black", "black", "--seconds 5 --seed 909"),
         Scene("low light", "low-light", "--seconds 5 --seed 910"),
     )),
-    ("lamps and paint", (
-        Scene("lamps and paint", "distractor", "--seconds 6 --seed 904"),
-        Scene("lamps and paint, another", "distractor", "--seconds 6 --seed 905"),
-        Scene("lamps and paint, 640x360", "distractor", "--seconds 6 --seed 914 --size 640x360"),
+    ("lamps and paint, 1280x720", tuple(
+        Scene(f"lamps and paint {s}", "distractor", f"--seconds 6 --seed {s}") for s in (904, 905, *range(921, 925))
+    )),
+    ("lamps and paint, 640x360", tuple(
+        Scene(f"lamps and paint {s}", "distractor", f"--seconds 6 --seed {s} --size 640x360")
+        for s in (914, *range(925, 929), *range(931, 937))
     )),
 )
 """More runs of a kind, judged together: what a dozen features cannot tell."""
