@@ -151,7 +151,7 @@ pub fn find(
             gathered.add(examined);
         }
     }
-    if gathered.measured_cells == 0 {
+    if gathered.inspected_cells == 0 {
         return Ok(None);
     }
     Ok(Some(gathered.findings(&grid, options, chainage, (shape, radius_sd_mm), wave_mm, sampling)))

@@ -26,16 +26,16 @@ pub(super) struct Gathered {
     doubtful: usize,
     sections: Vec<SectionRow>,
     seen: Vec<Seen>,
-    pub measured_cells: usize,
+    pub inspected_cells: usize,
 }
 
 impl Gathered {
     pub(super) fn add(&mut self, examined: Examined) {
         self.doubtful += examined.doubtful;
         self.sections.extend(examined.sections);
-        self.measured_cells += examined.measured_cells;
+        self.inspected_cells += examined.inspected_cells;
         self.seen.push(Seen {
-            cells: examined.measured_cells,
+            cells: examined.inspected_cells,
             first: examined.first,
             last: examined.last,
             noise_mm: examined.noise_mm,
@@ -70,7 +70,7 @@ impl Gathered {
         self.sections.iter_mut().for_each(|row| row.chainage_mm = chainage.at_mm(row.x_mm));
         let (typical, worst) = self.limits(grid, wave_mm, sampling);
         let limit = limit_near(&typical, LIMIT_RADIUS_MM);
-        let area_mm2 = self.measured_cells as f64 * grid.cell_mm * grid.cell_mm;
+        let area_mm2 = self.inspected_cells as f64 * grid.cell_mm * grid.cell_mm;
         let (length_mm, height_mm) = (grid.columns as f64 * grid.cell_mm, grid.rows as f64 * grid.cell_mm);
         let noise_mm = reference::median(self.seen.iter().map(|s| s.noise_mm).collect()).unwrap_or(0.0);
         let list = DefectList {

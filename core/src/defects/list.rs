@@ -201,9 +201,9 @@ pub struct Inspected {
     pub length_mm: f64,
     /// Height of the map, mm.
     pub height_mm: f64,
-    /// Measured area, mm².
+    /// Area that was searched, mm²: measured, and surely enough.
     pub area_mm2: f64,
-    /// Measured share of the map, 0 to 1.
+    /// Its share of the map, 0 to 1.
     pub coverage: f64,
 }
 

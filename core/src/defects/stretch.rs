@@ -83,11 +83,11 @@ pub(super) struct Examined {
     pub sections: Vec<SectionRow>,
     /// Deviation from the undamaged shape in the core's columns, mm.
     pub residual: Field,
+    pub inspected_cells: usize,
     /// What the first and the last search listed.
     pub first: Threshold,
     pub last: Threshold,
     pub noise_mm: f64,
-    pub measured_cells: usize,
 }
 
 /// Examines a stretch; `depth` is its world z in cells. `None` where too little was measured.
@@ -138,15 +138,16 @@ pub(super) fn examine(task: &Task, depth: &Field, doubt: &Doubt) -> Option<Exami
     let slack_mm = 3.0 * grid.cell_mm;
     let mine = |d: &Defect| d.x_mm >= x_from - slack_mm && d.x_mm <= x_to + slack_mm;
     let last = Threshold::of(&thresholds_mm);
+    let residual = core_of(task, &off);
     Some(Examined {
         defects: defects.into_iter().filter(mine).map(|d| placed(d, &reference, options)).collect(),
         doubtful,
         sections: sections(task, depth, &off, &smooth, &free, &reference),
-        residual: core_of(task, &off),
+        inspected_cells: residual.values.iter().filter(|z| z.is_finite()).count(),
+        residual,
         first,
         last,
         noise_mm: f64::from(noise.quantile_mm(0.5)),
-        measured_cells: core_of(task, depth).values.iter().filter(|z| z.is_finite()).count(),
     })
 }
 

@@ -182,6 +182,9 @@ fn a_doubtful_spike_in_a_dent_does_not_spoil_its_figures() {
     let doubted = found(&mut Weighed { map, weight: &weight });
     let [dent] = &doubted.list.defects[..] else { unreachable!("{:#?}", doubted.list.defects) };
     assert!((dent.depth_mm - 6.0).abs() < 0.4 && (dent.x_mm - 600.0).hypot(dent.y_mm) < 2.0, "{dent:#?}");
+    // What was left out was not searched.
+    let coverages = [&doubted, &believed].map(|found| found.list.inspected.coverage);
+    assert!(coverages[0] < coverages[1] && coverages[0] > coverages[1] - 0.01, "{coverages:?}");
     let as_good = |d: &Defect| (d.depth_mm - 6.0).abs() < 0.4 && (d.x_mm - 600.0).hypot(d.y_mm) < 2.0;
     assert!(believed.list.defects.len() != 1 || !as_good(&believed.list.defects[0]), "the spike is none");
 }

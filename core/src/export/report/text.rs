@@ -242,8 +242,8 @@ pub(super) fn method(page: &mut String, run: &ReportRun, list: &DefectList) {
     page.push_str("</tbody></table><ul>");
     let _ = write!(
         page,
-        "<li>{:.1} % of the map was not measured (highlights, shadows, edges): nothing can be said there. {} departures beside \
-         such places were too little seen to be believed.</li>",
+        "<li>{:.1} % of the map was not measured, or not surely (highlights, shadows, lamps, edges): nothing can be said there, the \
+         overview is grey. {} departures beside such places were too little seen to be believed.</li>",
         100.0 * (1.0 - list.inspected.coverage),
         list.doubtful
     );
