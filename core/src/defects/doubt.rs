@@ -1,9 +1,10 @@
 //! What of a map is too doubtful for a defect to be seen there.
 //!
-//! A highlight, a lamp behind the line or an edge of paint moves the stripe without leaving a gap. The stripe knows it: its
-//! uncertainty σ comes with the surface as each pixel's weight, w = 1 ∕ (1 + (σ ∕ 0.2 px)²), so a cell's doubt is the square of
-//! σ in fifths of a pixel. On 19 simulated walls with lamps, highlights and paint the upper half of what was no defect had a σ
-//! of 0.38 to 0.58 px, that of true ones 0.02 to 0.12 px, where the whole runs had 0.02 to 0.04 px.
+//! A highlight, a lamp behind the line or an edge of paint moves the stripe without leaving a gap. The stripe knows it:
+//! its uncertainty σ comes with the surface as each pixel's weight, w = 1 ∕ (1 + (σ ∕ 0.2 px)²), so a cell's doubt is the
+//! square of σ in fifths of a pixel. On five simulated walls full of lamps and paint the upper half of what was no defect
+//! had a σ of 0.38 to 0.58 px, that of true ones 0.02 to 0.12 px, where the whole runs had 0.02 to 0.04 px; on 16 others
+//! the limits below left one false finding of ten, and no true one was lost.
 
 use super::cells::Field;
 
